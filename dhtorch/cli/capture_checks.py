@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dhtorch.data.foreign_files import NEEDS_DEPTH
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, Scenes
@@ -24,8 +25,6 @@ _MAX_CHECKED_RECORDINGS = 12
 
 #: Frames of a recording that are examined for depth. Limits the time. Source: origin not recorded.
 _MAX_EXAMINED_FRAMES = 4
-
-NEEDS_DEPTH = "sensor depth of near surfaces is required for metric scale"
 
 
 def require_depth(scenes: Sequence[Scene], *, remedy: str | None = None) -> None:

@@ -463,10 +463,6 @@ def _check_options(settings: Mapping[str, Any]) -> None:
         is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
         if not is_whole and not (name == "gap" and value == plan.AUTO_GAP):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
-    if settings["max_frames"] is not None and not (
-        isinstance(settings["max_frames"], int) and settings["max_frames"] >= 1
-    ):
-        raise ValueError(f"max_frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
     if settings["pose_sigma"] is not None and settings["pose"] == "near":
         raise ValueError(f"pose_sigma: found {settings['pose_sigma']} with pose=near, expected pose=device or start")
     poses.parse_pose_sigmas(settings["pose_sigma"], "pose_sigma")

@@ -22,13 +22,13 @@ import torch
 from dhtorch import export
 from dhtorch.cli import complete, recover_page
 from dhtorch.cli import completed_folder as completed
-from dhtorch.cli.capture_checks import NEEDS_DEPTH, describe_missing_depth, print_check
+from dhtorch.cli.capture_checks import describe_missing_depth, print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
 from dhtorch.codes import Source
 from dhtorch.data import FORMATS, FormatError, open_all
-from dhtorch.data.foreign_files import PHONE_EXPORTS
+from dhtorch.data.foreign_files import NEEDS_DEPTH, PHONE_EXPORTS
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene

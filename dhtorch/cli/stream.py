@@ -30,10 +30,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     Raises:
         ValueError, OSError: bad options or data.
     """
-    if settings["max_frames"] is not None and (
-        not isinstance(settings["max_frames"], int) or settings["max_frames"] < 1
-    ):
-        raise ValueError(f"max_frames: found {settings['most']!r}, expected a whole number of at least 1")
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if settings["threads"] is not None:

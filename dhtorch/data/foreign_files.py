@@ -50,7 +50,8 @@ _MODEL_SUFFIXES: Final = (
     *(".splat", ".spz", ".pts", ".xyz"),
 )
 _VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-_NO_DEPTH: Final = "sensor depth of near surfaces is required for metric scale"
+#: What a capture without depth lacks, in messages.
+NEEDS_DEPTH: Final = "sensor depth of near surfaces is required for metric scale"
 
 
 class ForeignFile(NamedTuple):
@@ -91,12 +92,12 @@ def _export_of_video(file: Path) -> str | None:
 
 def _describe_video(file: Path) -> str:
     if file.suffix.lower() != ".mkv":
-        return f"a video without depth; {_NO_DEPTH}"
+        return f"a video without depth; {NEEDS_DEPTH}"
     try:
         tracks = matroska.list_video_tracks(file)
     except FormatError as error:
         return f"a video that cannot be read ({error.args[1]}: {error.args[2]})"
     if len(tracks) < 2:
-        return f"a video without depth; {_NO_DEPTH}"
+        return f"a video without depth; {NEEDS_DEPTH}"
     names = ", ".join(track.name or track.codec for track in tracks)
-    return f"a video of the tracks {names}, none of which is called DEPTH; {_NO_DEPTH}"
+    return f"a video of the tracks {names}, none of which is called DEPTH; {NEEDS_DEPTH}"

@@ -107,7 +107,16 @@ def _with_weights(weights: Dinov2Weights) -> torch.nn.Module:
     if wrong:
         raise ValueError(f"{weights.origin}: transformers set not all parameters of DINOv2: {wrong}")
     loaded: torch.nn.Module = network.float()
+    cast(Any, loaded).weights_origin = weights.origin
     return loaded
+
+
+def describe_weights(network: torch.nn.Module) -> str:
+    """Width, depth and file of a network with read weights, with what is to be known of them."""
+    loaded = cast(Any, network)
+    config = loaded.config
+    size = f"{len(loaded.encoder.layer)} of {config.num_hidden_layers} layers, width {config.hidden_size}"
+    return f"DINOv2 ({size}) with the weights of {loaded.weights_origin}"
 
 
 def _keep_layers(network: torch.nn.Module, layer: int | None) -> torch.nn.Module:

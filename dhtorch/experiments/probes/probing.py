@@ -184,6 +184,11 @@ class ProbeShards:
             self._temporary.cleanup()
 
 
+def split_into_chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
+    """Consecutive parts of at most ``n`` items, for one forward pass each."""
+    return [items[k : k + max(1, n)] for k in range(0, len(items), max(1, n))]
+
+
 def add_positive_control(blocks: Mapping[str, Tensor], target: Tensor, seed: int) -> dict[str, Tensor]:
     """The blocks with ``true_motion`` (n, D): the target (n, D) with :data:`CONTROL_NOISE`, from ``seed``."""
     generator = torch.Generator().manual_seed(seed)

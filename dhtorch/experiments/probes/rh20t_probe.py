@@ -280,11 +280,10 @@ def _make_shard(
         **networks,
     }
     parts: dict[str, list[Tensor]] = {name: [] for name in all_front_ends}
-    starts = range(0, len(index), max(1, settings.batch))
-    for start in progress(list(starts), recording.name, len(starts)):
-        chunk = slice(start, start + max(1, settings.batch))
+    chunks = probing.split_into_chunks(list(zip(index, before, strict=True)), settings.batch)
+    for chunk in progress(chunks, recording.name, len(chunks)):
         frames, seconds = (
-            [recording[k].to(settings.dtype).to(settings.device) for k in part[chunk]] for part in (index, before)
+            [recording[k].to(settings.dtype).to(settings.device) for k in part] for part in zip(*chunk, strict=True)
         )
         for name, front_end in all_front_ends.items():
             parts[name].append(front_end(frames, seconds).cpu())

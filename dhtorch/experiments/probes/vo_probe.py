@@ -138,10 +138,7 @@ def run(
         if note:
             outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
         else:
-            probed[_ALL_ROOMS if hold_out == "rooms" else room] = [
-                *probed.get(_ALL_ROOMS if hold_out == "rooms" else room, []),
-                *blocks_of,
-            ]
+            probed.setdefault(_ALL_ROOMS if hold_out == "rooms" else room, []).extend(blocks_of)
     needed: dict[str, int | None] = {}
     for name, members_blocks in probed.items():
         with ProbeShards(features) as shards:
@@ -291,11 +288,11 @@ class _PairFeatures:
         a, b = ([order[p[side]] for p in block] for side in (0, 1))
         features = {}
         for name, front_end in single.items():
-            parts = [front_end(chunk) for chunk in _chunks(list(frames.values()), settings.batch)]
+            parts = [front_end(chunk) for chunk in probing.split_into_chunks(list(frames.values()), settings.batch)]
             x = torch.cat(parts).cpu()
             features[name] = torch.cat((x[a], x[b] - x[a]), 1)
         forth, back, own = [], [], []
-        chunks = _chunks(list(block), settings.batch)
+        chunks = probing.split_into_chunks(list(block), settings.batch)
         for chunk in progress(chunks, scene.name, len(chunks)):
             first, second = ([frames[p[side]] for p in chunk] for side in (0, 1))
             x, added = two_view.features_and_keys(first, second)
@@ -306,11 +303,6 @@ class _PairFeatures:
             own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
         depth = torch.cat(forth)
         return {**features, "depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
-
-
-def _chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
-    """Consecutive parts of at most ``n`` items."""
-    return [items[k : k + n] for k in range(0, len(items), max(1, n))]
 
 
 def _motion_vectors(T: Tensor) -> Tensor:
