@@ -81,7 +81,7 @@ def is_static(x: Tensor) -> bool:
 def constant(like: Tensor, values: Sequence[Any]) -> Tensor:
     """Numbers, or rows of them -> tensor of the device and dtype of ``like``; not to be written to.
 
-    An accelerator keeps it for the next call: the host waits for each copy of its memory.
+    On an accelerator the tensor is cached, because the host waits for every copy from its memory.
     """
     if like.is_cpu or is_transformed():
         return like.new_tensor(values)
@@ -90,13 +90,13 @@ def constant(like: Tensor, values: Sequence[Any]) -> Tensor:
 
 @lru_cache(maxsize=MAX_CONSTANTS)
 def keep_beside(x: Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A kept tensor of the CPU, by identity, on an accelerator, which keeps it, too; not to be written to."""
+    """Copy of a cached CPU tensor on an accelerator, itself cached by the tensor's identity; not to be written to."""
     with torch.inference_mode(False):
         return x.to(dtype).to(device)
 
 
 def move_from_host(x: Tensor, like: Tensor) -> Tensor:
-    """``x.to(like)`` of a tensor of the CPU, for which the host does not wait."""
+    """``x.to(like)`` of a CPU tensor, without waiting for the transfer."""
     x = x.to(like.dtype)
     if like.is_cpu:
         return x

@@ -570,7 +570,7 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
 
 
 def _draws_beside(like: Tensor, seed: int | Tensor, hypotheses: int) -> Tensor:
-    """:func:`uniform_draws` of a batch (B, …), in its dtype and on its device; an accelerator keeps those of an int."""
+    """:func:`uniform_draws` of a batch (B, …) in its dtype, on its device; on an accelerator cached for an int seed."""
     if like.is_cpu or is_transformed() or not isinstance(seed, int):
         return move_from_host(uniform_draws(seed, len(like), hypotheses), like)
     return keep_beside(_draws_of_int(seed, hypotheses), like.dtype, like.device).expand(len(like), -1, -1)
