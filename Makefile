@@ -51,11 +51,15 @@ lint: $(VENV)/.installed-dev
 conf: $(VENV)/.installed
 	$(BIN)/python docs/settings.py
 
+# Compiled operators, where there is a C++ compiler; torch computes the same without.
+OPS = $(BIN)/python -m dhtorch.ops || echo "== operators are not compiled: torch computes instead"
+
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "== installing into $(VENV)"
 	$(PYTHON) -m venv $(VENV)
 	@$(TORCH)
 	$(PIP) -e .
+	@$(OPS)
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
@@ -63,6 +67,7 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	@$(TORCH)
 	$(PIP) -e ".[dev]"
+	@$(OPS)
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-all: $(VENV)/.installed-dev

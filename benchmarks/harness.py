@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import torch
 
-from dhtorch.ops import loader
+from dhtorch.ops import builder, loader
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.runtime.allocator import disable_malloc_trim
@@ -98,7 +98,7 @@ def with_compiled_operators() -> Iterator[None]:
 @cache
 def _library() -> Path:
     """The compiled file, built unless it was, and loaded for whoever asks."""
-    path = loader.build()
+    path = builder.build()
     torch.ops.load_library(str(path))
     return path
 

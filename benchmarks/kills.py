@@ -94,7 +94,9 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
 
 def _checkout() -> str:
     """The state of the code, which every file names."""
-    return str(result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0)["git"])
+    return str(
+        result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0, operators="torch")["git"]
+    )
 
 
 def start(command: str, folder: Path, limit: int | None = None) -> ForkProcess:

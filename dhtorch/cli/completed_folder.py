@@ -19,6 +19,7 @@ from dhtorch.codes import Gate, Source, names
 from dhtorch.data.io import decode as data_files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
@@ -95,7 +96,7 @@ def build_shared_metadata(
     (modules), the data digest, and ``more`` (which separates the files of different commands)."""
     config = {k: settings[k] for k in keyed} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
     run_metadata = result_files.collect_run_metadata(
-        device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"]
+        device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"], operators=loader.describe()
     )
     name = settings["choices"]["data"]
     metadata: Row = storage.to_strict_json(
@@ -108,6 +109,7 @@ def build_shared_metadata(
             "reach_m": layout.reach,
             "version": run_metadata["versions"]["dhtorch"],
             "git": run_metadata["git"],
+            "operators": run_metadata["operators"],
             "method": settings["choices"]["method"],
             "calibration": calibration,
             "key": result_files.compute_result_key({**config, "files": _FORMAT_VERSION, **more}, digest, roots=roots),

@@ -29,6 +29,7 @@ from dhtorch.extract.policy_columns import POLICY_COLUMNS
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.step_set import RldsSource
 from dhtorch.extract.targets import DatasetTarget
+from dhtorch.ops import loader
 from dhtorch.pipeline import dense
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
@@ -343,7 +344,9 @@ def _build_metadata(
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
     digest = result_files.compute_data_digest(files)
-    run_metadata = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    run_metadata = result_files.collect_run_metadata(
+        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe()
+    )
     name = settings["choices"]["data"]
     source = whole.roots[0].resolve().name if whole.roots else name
     metadata: Row = storage.to_strict_json(
@@ -351,6 +354,7 @@ def _build_metadata(
             "format": _FORMAT_VERSION,
             "version": run_metadata["versions"]["dhtorch"],
             "git": run_metadata["git"],
+            "operators": run_metadata["operators"],
             "key": result_files.compute_result_key(
                 {**config, "name": name, "files": _FORMAT_VERSION}, digest, roots=[MapRowDataset.__module__]
             ),

@@ -21,6 +21,7 @@ from dhtorch.experiments import report
 from dhtorch.experiments.focal.stacks import FocalStacks
 from dhtorch.experiments.pictures import draw_example
 from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
+from dhtorch.ops import loader
 from dhtorch.runtime import console, storage
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
@@ -132,7 +133,11 @@ def _build_result(
         experiment=experiment,
         key=key,
         meta=result_files.collect_run_metadata(
-            device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]
+            device=settings["device"],
+            dtype=settings["dtype"],
+            threads=threads,
+            seed=settings["seed"],
+            operators=loader.describe(),
         ),
         config=settings,
         data=data,

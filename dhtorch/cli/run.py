@@ -142,7 +142,7 @@ def _run_guarded(argv: list[str]) -> int:
 
 def _dispatch(argv: list[str]) -> int:
     if argv == ["--version"] or (len(argv) == 1 and argv[0] in _HELP_FLAGS):
-        print(f"dhtorch {dhtorch.__version__}" if argv[0] == "--version" else commands.format_overview(EXIT_CODES))
+        print(_format_version() if argv[0] == "--version" else commands.format_overview(EXIT_CODES))
         return EXIT_DONE
     named = bool(argv) and argv[0] in commands.COMMANDS
     if not named and argv:
@@ -162,6 +162,12 @@ def _dispatch(argv: list[str]) -> int:
         words.validate_words(argv, ["PATH", *(each for each in commands.COMMANDS if each != "recover")])
         return _run_hydra(argv)
     return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
+
+
+def _format_version() -> str:
+    """Version, and what computes the operators."""
+    operators = importlib.import_module("dhtorch.ops.loader").describe()
+    return f"dhtorch {dhtorch.__version__}, operators: {operators}"
 
 
 def _is_capture(argv: Sequence[str]) -> bool:

@@ -22,6 +22,7 @@ from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
 from dhtorch.extract.dataset import RowDataset, common_map_hw
 from dhtorch.extract.features import FeatureTable, JoinedDataset
+from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
@@ -172,12 +173,15 @@ def _shared_metadata(
     config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": key_options}
     files = {**result_files.list_files_below(extraction_plan.roots), **result_files.list_files_named(config)}
     name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
-    run_metadata = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    run_metadata = result_files.collect_run_metadata(
+        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe()
+    )
     metadata: dict[str, Any] = storage.to_strict_json(
         {
             "format": _FORMAT_VERSION,
             "version": run_metadata["versions"]["dhtorch"],
             "git": run_metadata["git"],
+            "operators": run_metadata["operators"],
             "versions": run_metadata["versions"],
             "key": result_files.compute_result_key(
                 {**config, "name": name, "format": _FORMAT_VERSION}, digest, roots=[RowDataset.__module__]

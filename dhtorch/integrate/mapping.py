@@ -29,6 +29,7 @@ from dhtorch.integrate.recording import PairEstimate, PlacedFrames
 from dhtorch.integrate.scales import MAX_REACH_TRUNCATIONS, N_MAPS_FOR_VOXEL, choose_coarse_voxel, merge_surfaces
 from dhtorch.integrate.sweeps import DenseSweep, SweepStore
 from dhtorch.metrics import bootstrap
+from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
 from dhtorch.records import Frame
@@ -414,7 +415,11 @@ def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: l
         experiment="integrate",
         key=result_files.compute_result_key({**config, "choices": choices}, digest, roots=[__name__]),
         meta=result_files.collect_run_metadata(
-            device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]
+            device=settings["device"],
+            dtype=settings["dtype"],
+            threads=threads,
+            seed=settings["seed"],
+            operators=loader.describe(),
         ),
         config=config,
         data={

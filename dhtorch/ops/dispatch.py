@@ -9,10 +9,10 @@
     def scale(x, *, factor):
         return x * factor
 
-``scale(x, factor=2.0)`` runs the kernel if the library is in use (:func:`dhtorch.ops.loader.load`, or DHTORCH_OPS=1)
-and all tensors are eligible, else the reference. The tensors of an operator are its positional parameters, its options
-keywords. A kernel allocates the outputs and calls the C++ operator that ``TORCH_LIBRARY`` registers in ``csrc``; it
-has no condition of its own.
+``scale(x, factor=2.0)`` runs the kernel if a library is installed or compiled (:mod:`dhtorch.ops.loader`;
+DHTORCH_OPS=0 leaves it unused) and all tensors are eligible, else the reference. The tensors of an operator are its
+positional parameters, its options keywords. A kernel allocates the outputs and calls the C++ operator that
+``TORCH_LIBRARY`` registers in ``csrc``; it has no condition of its own.
 
 Eligible are plain contiguous CPU tensors of the stated dtypes that are not being differentiated or transformed: no
 gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
@@ -21,7 +21,6 @@ gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
 from __future__ import annotations
 
 import inspect
-import os
 from collections.abc import Callable, Collection, Mapping
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
@@ -88,20 +87,16 @@ def operator(
 
 
 def is_in_use() -> bool:
-    """Whether kernels may run: the library is loaded or DHTORCH_OPS=1, and no compiler traces this code.
+    """Whether kernels may run: the library can be loaded, and no compiler traces this code.
 
     ``torch.autograd.forward_ad`` keeps tangents within plain tensors, so none are eligible while it is active.
 
     Raises:
-        FileNotFoundError: DHTORCH_OPS=1, and no library was compiled for this torch and processor.
+        OSError: DHTORCH_OPS=1, and no library can be loaded.
     """
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return False
-    if not loader.is_loaded():
-        if os.environ.get(loader.SWITCH, "") in ("", "0"):
-            return False
-        loader.load()
-    return True
+    return loader.is_loaded() or loader.load_if_present()
 
 
 def can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:

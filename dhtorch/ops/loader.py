@@ -1,7 +1,8 @@
-"""Compilation and loading of the C++ kernels of ``csrc``, which are optional: every operator has a torch reference.
+"""Finding, checking and loading the compiled kernels of ``csrc``: optional, as every operator has a torch reference.
 
-    python -m dhtorch.ops          compile them into the user's cache, with the system's C++ compiler
-    DHTORCH_OPS=1 python …         use them, in loader workers as well; or dhtorch.ops.loader.load() in a program
+    pip install dhtorch             a wheel for this platform holds them, and they are in use
+    python -m dhtorch.ops           compile them into the user's cache, with the system's C++ compiler
+    DHTORCH_OPS=0 python …          use torch alone; DHTORCH_OPS=1: an error where they cannot be loaded
 
 Which functions have a kernel, and for which tensors it runs: :mod:`dhtorch.ops.dispatch`. Agreement with the torch
 reference, which the tests check (``tests/ops/test_compiled.py``):
@@ -15,39 +16,42 @@ reference, which the tests check (``tests/ops/test_compiled.py``):
 - poses: 99 of 100 within a hundredth of their sigma; fitted surfaces: 99 of 100 depths within a tenth of their sigma,
   at most one gate in 200 differs.
 
-Nothing is compiled or downloaded without the command above. The library's name is a hash of its sources, torch's
-version, the compiler flags and the processor, the widest vector instructions of which it uses.
+A library is one file of one vector level (:data:`LEVELS`), chosen by the level that torch itself uses, and works with
+any torch that has the stable ABI. Its name has a hash of its sources and its manifest (``.json``) the file's checksum:
+a file of other sources, a changed one, or one that other users may write is not loaded; torch computes instead, and
+one warning says why.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import platform
-import shlex
-import shutil
-import subprocess
+import stat
 import sys
-import tempfile
+import warnings
 from pathlib import Path
 
 import torch
 
 from dhtorch import codes
 from dhtorch.ops import constants
-from dhtorch.runtime.results import describe_processor
 
 #: The command that compiles the library.
 COMMAND = "python -m dhtorch.ops"
 
-#: Environment variable: 1 loads the library on first use.
+#: Environment variable: 0 leaves the library unused, 1 makes it an error if it cannot be loaded.
 SWITCH = "DHTORCH_OPS"
 
-#: Lowest torch version whose headers have the stable ABI with ``TORCH_BOX``, which the sources use.
+#: Lowest torch version whose stable ABI has what the sources use.
 MIN_TORCH_VERSION = (2, 10)
 
 #: Folder of the C++ sources.
 FOLDER = Path(__file__).with_name("csrc")
+
+#: Folder of the libraries that a wheel brings.
+INSTALLED = Path(__file__).with_name("lib")
 
 #: C++ sources of the library.
 SOURCES = tuple(
@@ -58,20 +62,21 @@ SOURCES = tuple(
 #: Header that all sources include.
 HEADER = FOLDER / "vectors.h"
 
-#: Name of the generated header, as in the sources' ``#include``.
-CONSTANTS_HEADER = "constants.h"
-
 #: Code tables whose values are in the generated header, as ``<table>_<name>``.
 _CODE_TABLES = (codes.Flag, codes.Hole, codes.Source)
 
 #: No FMA contraction: torch rounds the product and the sum. ``-fno-math-errno -fno-trapping-math`` let square roots and
 #: selections be vectorised; results are unchanged.
-FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+FLAGS = ("-O3", "-std=c++20", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 
-#: Value of ATEN_CPU_CAPABILITY, which restricts torch's vector instructions -> the x86-64 level without wider ones.
-_LEVELS = {"avx2": "x86-64-v3", "default": "x86-64-v2"}
+#: Vector level of x86-64 that torch reports (``torch.backends.cpu.get_cpu_capability``) → compiler's name of the level;
+#: SSE4.2 for the processors below AVX2.
+LEVELS = {"AVX512": "x86-64-v4", "AVX2": "x86-64-v3", "DEFAULT": "x86-64-v2"}
+
+_X86_64 = ("x86_64", "amd64")
 
 _loaded: list[Path] = []
+_tried: list[bool] = []
 
 
 def cache() -> Path:
@@ -82,12 +87,28 @@ def cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dhtorch"
 
 
-def library() -> Path:
-    """Path of the library for these sources, this torch version and this processor, whether or not it exists."""
-    flags = (*FLAGS, *_vector_flags())
+def levels() -> tuple[str, ...]:
+    """Vector levels for which a library can be compiled on this machine; one, without a flag, other than on x86-64."""
+    return tuple(LEVELS.values()) if platform.machine().lower() in _X86_64 else (platform.machine().lower(),)
+
+
+def level() -> str:
+    """The vector level that torch uses in this process, which ATEN_CPU_CAPABILITY may restrict."""
+    if platform.machine().lower() not in _X86_64:
+        return levels()[0]
+    return LEVELS.get(torch.backends.cpu.get_cpu_capability(), LEVELS["DEFAULT"])
+
+
+def file_name(for_level: str) -> str:
+    """Name of the library of a level: with a hash of all that decides its content, but the compiler."""
     sources = (source.read_text(encoding="utf-8") for source in (HEADER, *SOURCES))
-    key = "\n".join((*sources, constants_header(), torch.__version__, describe_processor(), platform.machine(), *flags))
-    return cache() / f"dhtorch-{hashlib.sha256(key.encode()).hexdigest()[:16]}.so"
+    key = "\n".join((*sources, constants_header(), sys.platform, platform.machine(), *FLAGS))
+    return f"dhtorch-{hashlib.sha256(key.encode()).hexdigest()[:16]}-{for_level}.so"
+
+
+def library() -> Path:
+    """Path in the cache of the library for these sources and this processor, whether or not it exists."""
+    return cache() / file_name(level())
 
 
 def constants_header() -> str:
@@ -106,52 +127,98 @@ def constants_header() -> str:
     return "\n".join((*lines, "}  // namespace", ""))
 
 
-def build() -> Path:
-    """Compile the library unless it exists -> its path.
+def manifest(path: Path) -> Path:
+    """The file beside a library that holds its checksum."""
+    return path.with_name(f"{path.name}.json")
 
-    Raises:
-        OSError: torch older than :data:`MIN_TORCH_VERSION`; no compiler (CXX, else c++, g++ or clang++);
-            compilation failed, with the compiler's message; no permission to write.
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def problem(path: Path) -> str | None:
+    """Why an existing library must not be loaded; None = it may be.
+
+    Checked are the checksum in its manifest, and that no other user may write the file or its folder; a library of the
+    cache must also belong to this user or to the administrator.
     """
-    _check_torch_version()
-    path = library()
-    if path.is_file():
-        return path
-    compiler = _compiler_command()
-    torch_folder = Path(torch.__file__).parent
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        temporary = Path(folder) / path.name
-        (Path(folder) / CONSTANTS_HEADER).write_text(constants_header(), encoding="utf-8")
-        command = [*compiler, *FLAGS, *_vector_flags(), f"-I{folder}", f"-I{torch_folder / 'include'}"]
-        command += [*map(str, SOURCES), "-o", str(temporary)]
-        command += (
-            ["-undefined", "dynamic_lookup"]
-            if sys.platform == "darwin"
-            else [f"-L{torch_folder / 'lib'}", "-ltorch_cpu"]
-        )
-        process = subprocess.run(command, capture_output=True, text=True, check=False)
-        if process.returncode:
-            raise OSError(f"{shlex.join(command)}: exit code {process.returncode}\n{process.stderr.strip()}")
-        temporary.replace(path)
-    return path
+    for each in (path, path.parent):
+        status = each.stat()
+        if status.st_mode & stat.S_IWOTH:
+            return f"{each} may be written by other users"
+        if path.parent != INSTALLED and status.st_uid not in (0, _user(status.st_uid)):
+            return f"{each} belongs to another user"
+    try:
+        expected = json.loads(manifest(path).read_text(encoding="utf-8"))["sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"{manifest(path)} does not hold its checksum"
+    return None if checksum(path) == expected else f"{path} differs from its checksum"
+
+
+def _user(otherwise: int) -> int:
+    """This process's user; ``otherwise`` on systems without user numbers."""
+    return int(getattr(os, "getuid", lambda: otherwise)())
 
 
 def load() -> None:
     """Load the compiled library, which operators of this process then use.
 
     Raises:
-        FileNotFoundError: no library was compiled for these sources, this torch and this processor.
-        OSError: torch older than :data:`MIN_TORCH_VERSION`.
+        FileNotFoundError: no library for these sources and this processor is installed or in the cache.
+        OSError: torch older than :data:`MIN_TORCH_VERSION`; a library that must not or cannot be loaded.
     """
     if _loaded:
         return
-    _check_torch_version()
-    path = library()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no library for this torch and processor; compile it with {COMMAND}")
-    torch.ops.load_library(str(path))
-    _loaded.append(path)
+    check_torch_version()
+    name, reasons = file_name(level()), []
+    for path in (INSTALLED / name, cache() / name):
+        if not path.is_file():
+            continue
+        reason = problem(path)
+        if reason is None:
+            try:
+                torch.ops.load_library(str(path.resolve()))
+            except OSError as error:  # of another machine, or without libraries that it needs
+                reason = f"{path}: {str(error).splitlines()[0]}"
+        if reason is None:
+            _loaded.append(path)
+            return
+        reasons.append(reason)
+    if reasons:
+        raise OSError(f"compiled operators: {'; '.join(reasons)}; compile them again with {COMMAND}")
+    others = sorted(each.name for each in INSTALLED.glob("dhtorch-*.so"))
+    stale = f"; {INSTALLED} holds {others[0]}, of other sources or another processor" if others else ""
+    raise FileNotFoundError(
+        f"{cache() / name}: no library for these sources and this processor{stale}; compile it with {COMMAND}"
+    )
+
+
+def load_if_present() -> bool:
+    """Load the library at the first call if there is one, as DHTORCH_OPS says -> whether it is loaded.
+
+    A library that is there and must not be loaded is left with one warning.
+
+    Raises:
+        OSError: as :func:`load`, with DHTORCH_OPS=1.
+    """
+    switch = os.environ.get(SWITCH, "")
+    if switch == "0" or (not switch and _tried):
+        return False
+    try:
+        load()
+    except FileNotFoundError as error:
+        if switch:
+            raise
+        if "other sources" in str(error):
+            warnings.warn(f"{error} (torch is used)", stacklevel=2)
+    except OSError as error:
+        if switch:
+            raise
+        if _is_recent():
+            warnings.warn(f"{error} (torch is used)", stacklevel=2)
+    _tried.append(True)
+    return is_loaded()
 
 
 def is_loaded() -> bool:
@@ -159,24 +226,17 @@ def is_loaded() -> bool:
     return bool(_loaded)
 
 
-def _check_torch_version() -> None:
-    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    if version < MIN_TORCH_VERSION:
+def describe() -> str:
+    """What computes the operators of this process: ``compiled x86-64-v4``, or ``torch``."""
+    return f"compiled {level()}" if _loaded or load_if_present() else "torch"
+
+
+def check_torch_version() -> None:
+    """Raise an OSError for a torch without the stable ABI."""
+    if not _is_recent():
         expected = ".".join(map(str, MIN_TORCH_VERSION))
         raise OSError(f"compiled operators: found torch {torch.__version__}, expected at least {expected}")
 
 
-def _vector_flags() -> tuple[str, ...]:
-    """Compiler flag of the vector instructions of this processor, or of those torch is restricted to; x86-64 only."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return ()
-    capability = os.environ.get("ATEN_CPU_CAPABILITY", "").lower()
-    return (f"-march={_LEVELS.get(capability, 'native')}",)
-
-
-def _compiler_command() -> list[str]:
-    requested = shlex.split(os.environ.get("CXX", ""))
-    command = requested or [name for name in ("c++", "g++", "clang++") if shutil.which(name)][:1]
-    if not command or shutil.which(command[0]) is None:
-        raise OSError(f"{' '.join(requested) or 'c++, g++, clang++'}: no such C++ compiler; set CXX to another")
-    return command
+def _is_recent() -> bool:
+    return tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2]) >= MIN_TORCH_VERSION

@@ -63,7 +63,7 @@ _META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": d
 _META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
 #: Fields added later: optional when reading.
 _ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str, "metrics": list}
-_ADDED_META_FIELDS: dict[str, Any] = {"processor": str}
+_ADDED_META_FIELDS: dict[str, Any] = {"processor": str, "operators": str}
 _DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
 _SUMMARY_FIELDS: dict[str, Any] = {
     "value": _OPTIONAL_NUMBER,
@@ -281,14 +281,18 @@ def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
     return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
 
 
-def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
-    """Time, code version, package versions, hardware and seed of a job."""
+def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int, operators: str) -> dict[str, Any]:
+    """Time, code version, package versions, hardware and seed of a job.
+
+    ``operators`` is what computes those with compiled kernels: :func:`dhtorch.ops.loader.describe`.
+    """
     versions = {"python": platform.python_version(), **{name: _package_version(name) for name in _PACKAGES}}
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "git": read_git_revision(Path(__file__).parents[1]),
         "versions": versions,
         "processor": describe_processor(),
+        "operators": operators,
         "device": str(device),
         "dtype": str(dtype).removeprefix("torch."),
         "threads": threads,

@@ -18,6 +18,7 @@ from dhtorch import testing as writers
 from dhtorch.cli import inspect as capture
 from dhtorch.cli.run import EXIT_CODES, config_dir, job_name
 from dhtorch.experiments.report import page
+from dhtorch.ops import loader
 from dhtorch.runtime import console, storage
 from dhtorch.runtime.output_folder import open_output_file
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -257,7 +258,7 @@ def test_ctrl_c_keeps_the_old_page(command, monkeypatch, said, words, module, na
 
 def test_version_is_ours(command):
     code, out, _ = command("--version")
-    assert (code, out.strip()) == (0, f"dhtorch {dhtorch.__version__}")
+    assert (code, out.strip()) == (0, f"dhtorch {dhtorch.__version__}, operators: {loader.describe()}")
 
 
 # ----------------------------------------------------------------------------------------------------------- completion

@@ -48,7 +48,7 @@ def make_result(methods=("paper", "opencv"), **changes):
     parts = {
         "experiment": "pair",
         "key": "0" * 64,
-        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0),
+        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0, operators="torch"),
         "config": {},
         "data": {"name": "rooms", "scenes": ["kitchen [a]", "hall|b"], "n_pairs": 5, "digest": ""},
     }

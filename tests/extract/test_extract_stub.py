@@ -153,7 +153,7 @@ def test_other_data_is_another_question(made, tmp_path):
 def test_a_shard_tells_where_it_comes_from(made):
     folder = made(seed=3, options={"engine": "local"}).folder
     shared, own = shards.read_shard_metadata(shards.shard_files(folder)[1])
-    meta = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=3)
+    meta = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=3, operators="torch")
     assert shared["format"] == 1 and shared["git"] == meta["git"] and shared["versions"] == meta["versions"]
     assert shared["version"] == meta["versions"]["dhtorch"]
     assert shared["data"]["name"] == "made" and (shared["data"]["recordings"], shared["data"]["frames"]) == (2, 6)

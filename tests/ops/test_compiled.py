@@ -1,11 +1,14 @@
 """Compiled code answers as torch does, the sweep bit for bit, a search for points and the registration of their windows
 up to the rounding of sums; nothing is compiled, loaded or used that nobody asked for."""
 
+import json
+import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
+import warnings
 from types import SimpleNamespace
 
 import pytest
@@ -32,7 +35,7 @@ from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
-from dhtorch.ops import constants, dispatch, loader
+from dhtorch.ops import builder, constants, dispatch, loader
 from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import AUTO
@@ -52,10 +55,12 @@ needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32",
 
 
 @pytest.fixture(autouse=True)
-def unused(monkeypatch):
-    """Every test begins and ends without compiled code."""
-    monkeypatch.delenv("DHTORCH_OPS", raising=False)
+def unused(monkeypatch, tmp_path):
+    """Every test begins and ends without compiled code, and with none installed."""
+    monkeypatch.setenv("DHTORCH_OPS", "0")
     monkeypatch.setattr(loader, "_loaded", [])
+    monkeypatch.setattr(loader, "_tried", [])
+    monkeypatch.setattr(loader, "INSTALLED", tmp_path / "installed")
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +69,7 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DHTORCH_CACHE", str(folder))
-        loader.build()
+        builder.build()
     return folder
 
 
@@ -941,51 +946,197 @@ def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
 
 
 @needs_compiler
-def test_the_environment_asks_for_it(cache, monkeypatch):
+def test_a_library_is_in_use_where_there_is_one_unless_it_is_turned_off(cache, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(cache))
-    assert not dispatch.is_in_use()
-    monkeypatch.setenv("DHTORCH_OPS", "0")
-    assert not dispatch.is_in_use() and not loader._loaded
-    monkeypatch.setenv("DHTORCH_OPS", "1")
+    assert not dispatch.is_in_use() and loader.describe() == "torch" and not loader._loaded
+    monkeypatch.delenv("DHTORCH_OPS")
     assert dispatch.is_in_use() and loader._loaded == [loader.library()]
-    assert list(cache.iterdir()) == [loader.library()], "nothing unfinished stays"
-    monkeypatch.setattr(loader, "describe_processor", lambda: "another one")
-    assert not loader.library().exists()
+    assert loader.describe() == f"compiled {loader.level()}"
+    assert {*cache.iterdir()} == {loader.library(), loader.manifest(loader.library())}, "nothing unfinished stays"
 
 
-def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
+def test_without_a_library_torch_computes_and_nothing_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
+    monkeypatch.delenv("DHTORCH_OPS")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not dispatch.is_in_use() and loader.describe() == "torch"
     monkeypatch.setenv("DHTORCH_OPS", "1")
     with pytest.raises(FileNotFoundError, match=f"no library for .*; compile it with {loader.COMMAND}"):
         plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()
 
 
+def copy_of(cache, folder):
+    """The compiled library and its manifest, copied to another cache -> its path."""
+    shutil.copytree(cache, folder)
+    return folder / loader.library().name
+
+
+def damage(path):
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def make_foreign(path):
+    """A file with a right checksum that no processor can load."""
+    path.write_bytes(b"\x7fELF" + bytes(200))
+    loader.manifest(path).write_text(json.dumps({"sha256": loader.checksum(path)}))
+
+
+def lose_the_manifest(path):
+    loader.manifest(path).unlink()
+
+
+def spoil_the_manifest(path):
+    loader.manifest(path).write_text('{"sha256": null')
+
+
+def open_the_file(path):
+    path.chmod(0o777)
+
+
+def open_the_folder(path):
+    path.parent.chmod(0o777)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (damage, "differs from its checksum"),
+        (truncate, "differs from its checksum"),
+        (empty, "differs from its checksum"),
+        (make_foreign, "Could not load|file"),
+        (lose_the_manifest, "does not hold its checksum"),
+        (spoil_the_manifest, "does not hold its checksum"),
+        (open_the_file, "may be written by other users"),
+        (open_the_folder, "may be written by other users"),
+    ],
+)
+def test_a_spoiled_library_is_left_with_one_warning_and_built_again(cache, tmp_path, monkeypatch, spoil, message):
+    path = copy_of(cache, tmp_path / "copy")
+    spoil(path)
+    monkeypatch.setenv("DHTORCH_CACHE", str(path.parent))
+    monkeypatch.delenv("DHTORCH_OPS")
+    with pytest.warns(UserWarning, match=message) as heard:
+        assert not dispatch.is_in_use() and not dispatch.is_in_use()
+    assert len(heard) == 1 and "torch is used" in str(heard[0].message) and loader.COMMAND in str(heard[0].message)
+    monkeypatch.setenv("DHTORCH_OPS", "1")
+    with pytest.raises(OSError, match=message):
+        loader.load()
+    if spoil not in (make_foreign, open_the_folder):
+        monkeypatch.setattr(builder, "_compile", lambda compiler, work, level: write(work / "made.so", b"new"))
+        assert builder.build() == path and path.read_bytes() == b"new" and loader.problem(path) is None
+
+
+def write(path, data):
+    path.write_bytes(data)
+    return path
+
+
+@needs_compiler
+def test_a_library_of_other_sources_is_left(cache, tmp_path, monkeypatch):
+    name = copy_of(cache, tmp_path / "installed").name
+    for file in (tmp_path / "installed").iterdir():
+        file.rename(file.with_name(file.name.replace(name[8:24], "0123456789abcdef")))
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
+    monkeypatch.delenv("DHTORCH_OPS")
+    with pytest.warns(UserWarning, match="of other sources or another processor"):
+        assert not dispatch.is_in_use()
+
+
+@needs_compiler
+def test_the_library_of_a_wheel_is_used_before_the_cache(cache, tmp_path, monkeypatch):
+    path, opened = copy_of(cache, tmp_path / "installed"), []
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    monkeypatch.delenv("DHTORCH_OPS")
+    monkeypatch.setattr(torch.ops, "load_library", opened.append)  # a process registers the operators once
+    assert dispatch.is_in_use() and loader._loaded == [path] and opened == [str(path.resolve())]
+
+
+@needs_compiler
+def test_two_processes_may_build_at_once(tmp_path, monkeypatch):
+    """Each writes files of its own; the names are those of whole files at any time."""
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "cache"))
+    made = []
+
+    def compile_while_another_does(compiler, work, level):
+        if not made:
+            made.append(work)
+            builder.build()  # the other process, from beginning to end
+        return write(work / "made.so", b"whole")
+
+    monkeypatch.setattr(builder, "_compile", compile_while_another_does)
+    path = builder.build()
+    assert loader.problem(path) is None and path.read_bytes() == b"whole"
+    assert {*path.parent.iterdir()} == {path, loader.manifest(path)}
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() == 0, reason="the administrator may write everywhere")
+def test_a_cache_without_permission_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir(mode=0o500)
+    with pytest.raises(OSError, match=r"cache: no permission to write .*; set DHTORCH_CACHE"):
+        builder.build()
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "cache"))
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(builder.tempfile, "TemporaryDirectory", refuse)
+    with pytest.raises(OSError, match=r"cache: no permission to write .*; set DHTORCH_CACHE"):
+        builder.build()
+
+
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="levels are those of x86-64")
 def test_a_torch_held_to_narrower_vectors_has_a_file_of_its_own(monkeypatch):
-    monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
-    own, flags = loader.library(), loader._vector_flags()
-    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
-    assert (flags, loader._vector_flags()) == (("-march=native",), ("-march=x86-64-v3",))
-    assert loader.library() != own
+    files = set()
+    for capability, level in loader.LEVELS.items():
+        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda word=capability: word)
+        assert loader.level() == level and level in loader.library().name
+        files.add(loader.library())
+    assert len(files) == len(loader.levels()) == 3
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "another")
+    assert loader.level() == "x86-64-v2"
 
 
-def test_another_torch_and_another_processor_have_a_file_of_their_own(monkeypatch):
-    files = [loader.library()]
-    with monkeypatch.context() as other:
-        other.setattr(torch, "__version__", "1.0")
-        files.append(loader.library())
-    monkeypatch.setattr(loader, "describe_processor", lambda: "another, AVX2")
-    assert len({*files, loader.library()}) == 3
+def test_another_torch_shares_the_file(monkeypatch):
+    before = loader.library()
+    monkeypatch.setattr(torch, "__version__", "2.11.1")
+    assert loader.library() == before
+
+
+@pytest.mark.parametrize("machine", ["aarch64", "arm64"])
+def test_a_processor_without_levels_has_one_file(monkeypatch, machine):
+    before = loader.library()
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert loader.levels() == (machine,) and loader.library() != before and machine in loader.library().name
 
 
 def test_a_torch_that_is_too_old_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
     for old in ("2.5.1+cpu", "2.9.0a0+git1"):
         monkeypatch.setattr(torch, "__version__", old)
-        for call in (loader.build, loader.load):
+        for call in (builder.build, loader.load):
             with pytest.raises(OSError, match=rf"found torch {re.escape(old)}, expected at least 2\.10"):
                 call()
+        monkeypatch.delenv("DHTORCH_OPS", raising=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert not dispatch.is_in_use(), "the reference computes, without a warning"
     assert not list(tmp_path.iterdir())
 
 
@@ -1005,5 +1156,5 @@ def test_a_compiler_that_is_missing_or_fails_is_reported(tmp_path, monkeypatch):
     if shutil.which("false"):
         monkeypatch.setenv("CXX", "false --kind")
         with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
-            loader.build()
+            builder.build()
         assert not list(tmp_path.iterdir())

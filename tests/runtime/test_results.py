@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -224,7 +225,7 @@ def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch):
 
 
 def test_meta_says_when_and_with_what():
-    meta = result_files.collect_run_metadata(device="cpu", dtype=torch.float64, threads=2, seed=7)
+    meta = result_files.collect_run_metadata(device="cpu", dtype=torch.float64, threads=2, seed=7, operators="torch")
     assert meta["dtype"] == "float64" and meta["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
     assert meta["utc"].endswith("+00:00") and (meta["git"] is None or isinstance(meta["git"], str))
 
@@ -648,7 +649,7 @@ def test_places_are_relative_to_the_collection_or_a_last_word(tmp_path, monkeypa
 
 
 def test_meta_holds_what_it_was_given_and_what_is_installed(tmp_path, monkeypatch):
-    meta = result_files.collect_run_metadata(device="cuda:1", dtype="float16", threads=3, seed=11)
+    meta = result_files.collect_run_metadata(device="cuda:1", dtype="float16", threads=3, seed=11, operators="torch")
     assert (meta["device"], meta["dtype"], meta["threads"], meta["seed"]) == ("cuda:1", "float16", 3, 11)
     assert {"python", "dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core"} == set(
         meta["versions"]
@@ -662,7 +663,9 @@ def test_meta_holds_what_it_was_given_and_what_is_installed(tmp_path, monkeypatc
         raise result_files.importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(result_files.importlib.metadata, "version", absent)
-    versions = result_files.collect_run_metadata(device="cpu", dtype="x", threads=1, seed=0)["versions"]
+    versions = result_files.collect_run_metadata(device="cpu", dtype="x", threads=1, seed=0, operators="torch")[
+        "versions"
+    ]
     assert versions["torch"] is None and versions["python"]
 
 
@@ -672,7 +675,8 @@ def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
     package.mkdir()
     (package / "__init__.py").write_text("")
     monkeypatch.setattr(result_files, "__file__", str(package / "runtime/results.py"))
-    commit = lambda: result_files.collect_run_metadata(device="cpu", dtype="x", threads=1, seed=0)["git"]  # noqa: E731
+    metadata = partial(result_files.collect_run_metadata, device="cpu", dtype="x", threads=1, seed=0, operators="torch")
+    commit = lambda: metadata()["git"]  # noqa: E731
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert commit() is None
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]

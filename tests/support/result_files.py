@@ -114,7 +114,7 @@ def result(experiment, rows, summary=None, data=None, **changes):
     parts = {
         "experiment": experiment,
         "key": "0" * 64,
-        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0),
+        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0, operators="torch"),
         "config": {"seed": 0, "method": {"n": 2048, "track": {"levels": 4}}},
         "data": data or DATA,
         "summary": summarise_rows(rows, variants, cohorts) if summary is None else summary,

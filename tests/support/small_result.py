@@ -14,7 +14,7 @@ KEY = "0123456789abcdef" * 4
 @cache
 def meta_now():
     """Metadata of a run in this process, collected once."""
-    return result_files.collect_run_metadata(device="cpu", dtype=torch.float32, threads=1, seed=0)
+    return result_files.collect_run_metadata(device="cpu", dtype=torch.float32, threads=1, seed=0, operators="torch")
 
 
 def result(**changes):
