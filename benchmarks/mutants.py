@@ -370,7 +370,7 @@ def _run_tests(tree: Path, module: str, tests: Sequence[str], order: Mapping[str
         os.dup2(log, 1)
         os.dup2(log, 2)
         os.chdir(tree)
-        os.environ |= {"PYTHONPATH": str(tree), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+        os.environ |= {"PYTHONPATH": str(tree), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "DHTORCH_OPS": "0"}
         sys.path[:0] = [str(tree)]
         import pytest
 

@@ -36,6 +36,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import solve_spd
 from dhtorch.records import DepthMap, Estimate, Samples
+from dhtorch.runtime.numerics import standard_numerics
 
 #: What the values of a map mean: depth in metres, depth up to scale, depth up to scale and shift, inverse depth up to
 #: scale and shift, or any increasing function of depth.
@@ -72,6 +73,7 @@ class ModelSelection(NamedTuple):
     family: Tensor | None = None  # (B,) int64, index in ``map_family.MAP_FAMILIES``; None = not looked for
 
 
+@standard_numerics
 def align_depth(
     depth_map: Tensor,  # (B, h, w) or DepthMap
     references: Samples | Estimate | DepthMap | Sequence[Samples | Estimate | DepthMap],

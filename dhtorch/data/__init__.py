@@ -50,6 +50,7 @@ from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.data.unread import report_unread
 from dhtorch.runtime import console
+from dhtorch.runtime.numerics import standard_numerics
 
 __all__ = [
     "FORMATS",
@@ -125,6 +126,7 @@ _IMAGE_FOLDERS: Final = ("images", "image", "rgb", "color", "colour")
 _MAX_NAMES_SHOWN = 4  # names of recordings in a message
 
 
+@standard_numerics
 def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: object) -> Recording:
     """Open the only recording at ``root``; see :func:`open_all` for the arguments.
 
@@ -141,6 +143,7 @@ def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, 
     return recordings[0]
 
 
+@standard_numerics
 def open_all(
     root: str | Path,
     format: str = "auto",
@@ -215,6 +218,7 @@ class _RestrictedOpener:
             return self.corrections.apply(replace(self.make(i), bounds=self.bounds))
 
 
+@standard_numerics
 def open_capture(
     root: str | Path,
     format: str = "auto",

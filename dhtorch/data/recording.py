@@ -21,6 +21,7 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.numerics import standard_numerics
 
 _Item = TypeVar("_Item")
 
@@ -75,6 +76,7 @@ class Recording(Sequence[Frame]):
     def __len__(self) -> int:
         return self.number.shape[0]
 
+    @standard_numerics
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would decode
         i = self._position(index)
         with restrict_links(self.bounds):

@@ -20,6 +20,7 @@ from dhtorch.geometry import epipolar
 from dhtorch.geometry.p3p import p3p
 from dhtorch.geometry.se3 import Pose
 from dhtorch.records import Samples, TrackHint, Tracks
+from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
 
@@ -42,6 +43,7 @@ class PnPSolution(NamedTuple):
     covariance: Tensor  # (*, 6, 6) of a left perturbation (rotation rad, translation), 0 where not valid
 
 
+@standard_numerics
 def triangulate_points_one_sided(
     points1: Tensor,  # (*, N, 2) px, exact
     points2: Tensor,  # (*, N, 2) px, measured
@@ -107,6 +109,7 @@ def triangulate_points_one_sided(
     return points3d.reshape(*batch, N, 3), covariance.reshape(*batch, N, 3, 3)
 
 
+@standard_numerics
 def track_points_lk(
     image1: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image2: Tensor,  # (B, C, H', W')
@@ -172,6 +175,7 @@ def track_points_lk(
     return PointTracks(tracks.uv_1, tracks.valid, tracks.error, tracks.cov)
 
 
+@standard_numerics
 def solve_p3p(
     world_points: Tensor,  # (*, 3, 3) point, coordinate
     img_points: Tensor,  # (*, 3, 2) px
@@ -209,6 +213,7 @@ def solve_p3p(
     return torch.cat((R, t[..., None]), -1).reshape(*batch, 4, 3, 4), valid.reshape(*batch, 4)
 
 
+@standard_numerics
 def solve_pnp_ransac(
     world_points: Tensor,  # (*, N, 3)
     img_points: Tensor,  # (*, N, 2) px

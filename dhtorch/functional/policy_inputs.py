@@ -27,6 +27,7 @@ from torch import Tensor
 from dhtorch.codes import Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
+from dhtorch.runtime.numerics import standard_numerics
 
 #: m, depth of the last code of channel 0; the first is 255 times as far, 63.75 m. Source: derived: half a code is 0.8 %
 #: at 1 m, 1 / (510 · 0.25).
@@ -56,6 +57,7 @@ class GeometryImage(NamedTuple):
     source: Tensor  # (*, H, W) int32, codes.Source
 
 
+@standard_numerics
 def geometry_image(
     depth: Tensor,  # (*, H, W) m; 0 or not finite = none
     sigma: Tensor,  # (*, H, W) m; 0 or not finite = unknown
@@ -91,6 +93,7 @@ def geometry_image(
     return torch.stack(codes, -3).to(torch.uint8)
 
 
+@standard_numerics
 def decode_geometry_image(
     image: Tensor,  # (*, 3, H, W) uint8, or floating point in [0, 1]
 ) -> GeometryImage:
@@ -123,6 +126,7 @@ def decode_geometry_image(
     return GeometryImage(depth, torch.where(green > 0, depth * ratio, 0.0), source)
 
 
+@standard_numerics
 def point_cloud(
     depth: Tensor,  # (*, H, W) m; 0 or not finite = none
     K: Tensor,  # (*, 3, 3) or (3, 3) px, of the map

@@ -22,8 +22,10 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import FUSED
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import NO_HINT, DepthMap, Frame, PoseFit, PosePrior, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 
 
+@standard_numerics
 def complete_depth(
     reference: Frame,
     others: Frame | Sequence[Frame],

@@ -15,6 +15,7 @@ from dhtorch.pipeline.multiview import estimate_multiview
 from dhtorch.pipeline.pair import StageTimer, estimate_pair
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,6 +35,7 @@ class Method(MethodSpec):
         used = ", ".join(f"{name}={text}" for name, text in shown.items() if name != "fuse" or self.views > 1)
         return f"Method(n={self.n}, views={self.views}, {used})"
 
+    @standard_numerics
     def __call__(
         self,
         reference: Frame,

@@ -20,6 +20,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import NO_HINT, Estimate, Frame, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 
 #: Mean support of the coarse flow below which two consecutive frames show different scenes. Consecutive real frames
 #: reach 0.65 and more, images of different rooms 0.07 to 0.33 (``data=shared_scenes``); built-in rooms of different
@@ -70,6 +71,7 @@ class Stream:
         """Drop all past frames: the next frame has no source view."""
         self.past.clear()
 
+    @standard_numerics
     def push(self, frame: Frame, *, trace: Trace | None = None) -> Estimate:
         """Depth at the samples of ``frame`` (B = 1), triangulated from past frames.
 

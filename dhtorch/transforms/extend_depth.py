@@ -19,6 +19,7 @@ from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import get_method
 from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.transforms import maps, poses, schema
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews, default_prefix
@@ -138,6 +139,7 @@ class ExtendDepth(torch.nn.Module):
             other.batched, other._batched_option = batched, batched
         return other
 
+    @standard_numerics
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """Sample or batch -> copy of it with the added columns; None if it is skipped."""
         if torch.compiler.is_compiling():

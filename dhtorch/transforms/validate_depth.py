@@ -14,6 +14,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
 from dhtorch.records import NO_HINT, DepthValidation, Frame, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.transforms.sample_access import SampleError, SampleReader, check_sample
 from dhtorch.transforms.sample_spec import SampleSpec, check_sample_orientation, default_prefix
 from dhtorch.validation.validate import validate_depth
@@ -85,6 +86,7 @@ class ValidateDepth(torch.nn.Module):
         self.prefix = default_prefix(self.views.image) if prefix is None else prefix
         self._batched_option = batched
 
+    @standard_numerics
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """Sample or batch -> copy of it with the added keys."""
         check_sample(sample, self.views.image, self.views.intrinsics, self._batched_option)

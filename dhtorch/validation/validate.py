@@ -31,6 +31,7 @@ from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import NO_HINT, DepthValidation, Estimate, Frame, PoseFit, TrackHint
+from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.validation import evidence, wrong_causes
 from dhtorch.validation.evidence import Evidence, ValidationReferences
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
@@ -41,6 +42,7 @@ from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOpt
 QUICK_METHOD = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
 
 
+@standard_numerics
 def validate_depth(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = no value; None = the sensor's own
     reference: Frame,
@@ -119,6 +121,7 @@ def validate_depth(
 
 
 @torch.no_grad()
+@standard_numerics
 def validate_against(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = no value; None = the sensor's own
     reference: Frame,
