@@ -1,4 +1,4 @@
-"""Validation of the views of a method: one device, one precision, no empty frames."""
+"""Validation of the views of a method: dtypes, channels, range of values, one device and precision, no empty frames."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import pytree
+from dhtorch.geometry.checks import is_static
 from dhtorch.records import Camera, Frame
 
 #: Fields that a method reads of its reference view; timestamps and poses of a data set are not among them.
@@ -15,6 +16,14 @@ REFERENCE_FIELDS = "image", "depth", "conf", "sparse", "camera", "depth_camera"
 
 #: Fields that a method reads of its other views.
 SOURCE_FIELDS = "image", "camera"
+
+#: Largest value of a floating image in [0, 1], with room for brightness that an augmentation added; images in [0, 255]
+#: exceed it. Source: derived, twice the range.
+MAX_IMAGE_VALUE = 2.0
+
+#: Every so many pixels of a row and a column are compared with it, so that a check costs nothing beside a stage.
+#: Source: derived, 1 of 64 pixels.
+_CHECK_STRIDE = 8
 
 
 def validate_views(reference: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
@@ -25,7 +34,8 @@ def validate_views(reference: Frame, others: Frame | Sequence[Frame]) -> tuple[F
 
     Raises:
         TypeError: an argument that is not a Frame.
-        ValueError: no other view, a frame without a view or a pixel, or tensors on different devices.
+        ValueError: no other view, a frame without a view or a pixel, tensors on different devices, images other than
+            uint8 or floating in [0, 1] of 1 or 3 channels, depth of integers.
 
     Gradient: to images and intrinsics, through the change of precision.
     """
@@ -53,6 +63,30 @@ def _check_frame(name: str, frame: Frame, fields: tuple[str, ...], device: torch
             raise ValueError(
                 f"method: {name}.{field} is on {x.device}, reference.image on {device}, expected one device"
             )
+    _check_image(f"method: {name}.image", frame.image)
+    if "depth" in fields and not frame.depth.is_floating_point():
+        raise ValueError(
+            f"method: {name}.depth is {_name(frame.depth)}, expected floating point, m (of mm: depth.float() / 1000)"
+        )
+
+
+def _check_image(where: str, image: Tensor) -> None:
+    """Raise ValueError for an image of another dtype, number of channels or range; the range only where it is read
+    without waiting for a device."""
+    if image.dtype != torch.uint8 and not image.is_floating_point():
+        raise ValueError(f"{where} is {_name(image)}, expected uint8, or floating point in [0, 1]")
+    if image.ndim == 4 and image.shape[1] not in (1, 3):
+        raise ValueError(
+            f"{where} has shape {tuple(image.shape)}, expected (B C H W) with C 1 or 3 (RGBA: image[:, :3])"
+        )
+    if image.is_floating_point() and not is_static(image):
+        largest = float(image.detach()[..., ::_CHECK_STRIDE, ::_CHECK_STRIDE].amax())
+        if largest > MAX_IMAGE_VALUE:
+            raise ValueError(f"{where} has values up to {largest:g}, expected [0, 1] (of [0, 255]: image / 255)")
+
+
+def _name(x: Tensor) -> str:
+    return str(x.dtype).removeprefix("torch.")
 
 
 def _iter_tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
