@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.codecs.exr import read_exr
-from dhtorch.data.codecs.npy import read_npz
+from dhtorch.data.codecs.npy import read_npz, read_real_npy
 from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.codecs.tiff import read_tiff
 from dhtorch.data.io import decode as files
@@ -50,6 +50,10 @@ _NPZ_KEYS = ("depth", "depths", "depth_map", "depth_maps")
 
 #: End of the names of validity masks beside depth maps, as in DIODE; they are left out.
 _MASK_PATTERN = re.compile(r"(?:^|[_.-])(?:valid[_.-]?)?mask$", re.IGNORECASE)
+
+#: Largest depth of a map, m; beyond are numbers of another unit or kind. Source: derived, beyond any sight in a picture
+#: of rooms, streets or landscapes that these maps show.
+_MAX_DEPTH_M = 10_000.0
 
 #: Maps whose values are examined for plausibility, evenly spaced.
 _N_EXAMINED_MAPS = 3
@@ -104,7 +108,8 @@ class DepthMaps:
         """(1, h, w) m float32 of frame ``i``, 0 = no depth; None where there is no file.
 
         Raises:
-            FormatError: a damaged file, one of another format, or a portrait map of a landscape image (or vice versa).
+            FormatError: a damaged file, one of another format, a depth beyond 10 km, or a portrait map of a landscape
+                image (or vice versa).
         """
         file = self.files[i]
         if file is None:
@@ -112,7 +117,10 @@ class DepthMaps:
         array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
         _check_shape(file, array.shape, self.hw)
         stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
-        return clear_no_depth(stored * self.unit.metres, self.unit.metres)
+        depth = clear_no_depth(stored * self.unit.metres, self.unit.metres)
+        if (largest := float(depth.max())) > _MAX_DEPTH_M:
+            raise FormatError(file, "depth", f"{largest:.4g} m", f"at most {_MAX_DEPTH_M:g} m; see depth_unit")
+        return depth
 
 
 def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:
@@ -136,7 +144,9 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
     root = Path(folder).expanduser()
     if not root.is_dir():
         raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
-    metadata_file = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
+    metadata_file = root / "complete.json"
+    if unit is None and root.name == "depth" and (root.parent / "complete.json").is_file():
+        raise FormatError(root, "depth", "a part of a folder of dhtorch complete", f"{root.parent}, or depth_unit")
     depth_folder = root / "depth" if (root / "depth").is_dir() else root
     candidates = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
     masks = [file for file in candidates if _MASK_PATTERN.search(file.stem)]
@@ -252,13 +262,7 @@ def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> Non
 
 def _read_npy(file: Path) -> np.ndarray:
     """NPY file → numbers; object arrays are refused, since unpickling can run code."""
-    try:
-        array = np.load(io.BytesIO(files.read_bytes(file)), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise FormatError(file, "depth", f"{type(error).__name__}", "a NPY array of numbers") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise FormatError(file, "depth", "no array of numbers", "a NPY array of numbers")
-    return array
+    return read_real_npy(file, "depth")
 
 
 def _read_npz_depth(file: Path) -> np.ndarray:

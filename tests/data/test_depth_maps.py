@@ -1,5 +1,10 @@
 """Folders of depth maps as other tools write them: clips in one file, masks, units, sentinels, numbering."""
 
+import io
+import struct
+import warnings
+import zipfile
+
 import numpy as np
 import pytest
 import torch
@@ -134,3 +139,62 @@ def test_values_that_are_no_depth_in_the_unit_are_doubted(tmp_path, room, truth,
             np.save(tmp_path / f"{k}.npy", x.astype(np.float32))
     (doubt,) = open_depth_maps(tmp_path, room).doubts
     assert doubt.startswith("warning: maps: ") and words in doubt and "data." not in doubt
+
+
+def npy_claiming(shape, data=b""):
+    """An NPY file whose header claims another shape than its values have."""
+    header = str({"descr": "<f4", "fortran_order": False, "shape": shape}).encode()
+    header += b" " * (64 - (len(header) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+def pfm_of(scale, values):
+    return f"Pf\n{values.shape[1]} {values.shape[0]}\n{scale}\n".encode() + values.astype("<f4").tobytes()
+
+
+def npz_with(*members):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # two members of one name
+        for values in members:
+            archive.writestr("depth.npy", npy_claiming(values.shape, values.astype("<f4").tobytes()))
+    return stream.getvalue()
+
+
+HOSTILE = {
+    "npy: found 0 bytes, expected (1000000000, 1000000000)": lambda z: npy_claiming((10**9, 10**9)),
+    "npy: found 100 bytes, expected (100000, 100000)": lambda z: npy_claiming((10**5, 10**5), bytes(100)),
+    "npy shape: found (-72, 96)": lambda z: npy_claiming((-72, 96), z.tobytes()),
+    "npy: found ValueError": lambda z: b"\x93NUMPY\x01\x00\xff\xff{{{{",
+    "npy: found 2e+05 m, expected at most 10000 m": lambda z: npy_claiming(z.shape, (0 * z + 2e5).tobytes()),
+    "npz: found 2 members depth.npy, expected one": lambda z: npz_with(z, 2 * z),
+    "pfm: found 0.0, expected a number below 0": lambda z: pfm_of("0", z),
+    "pfm: found nan, expected a number below 0": lambda z: pfm_of("nan", z),
+    "pfm: found inf, expected a number below 0": lambda z: pfm_of("inf", z),
+}
+
+
+@pytest.mark.parametrize("message", HOSTILE)
+def test_hostile_maps_are_refused_in_one_line_before_memory_is_taken(tmp_path, room, truth, message):
+    suffix = message[:3]
+    for k in range(N):
+        (tmp_path / f"{k}.{suffix}").write_bytes(HOSTILE[message](truth[k]))
+    maps = open_depth_maps(tmp_path, room)
+    with pytest.raises(FormatError) as refused:
+        maps[1]
+    text = str(refused.value)
+    assert f"1.{suffix}" in text and message.partition("found ")[2] in text and "\n" not in text
+
+
+def test_the_unit_of_a_folder_above_is_not_taken(tmp_path, room, truth):
+    (tmp_path / "complete.json").write_text('{"unit_m": 0.5}')
+    for name in ("maps", "depth"):
+        (tmp_path / name).mkdir()
+        for k in range(N):
+            np.save(tmp_path / name / f"{k}.npy", truth[k])
+    assert np.array_equal(read_all(open_depth_maps(tmp_path / "maps", room)), truth)
+    with pytest.raises(
+        FormatError, match=f"a part of a folder of dhtorch complete, expected {tmp_path}, or depth_unit"
+    ):
+        open_depth_maps(tmp_path / "depth", room)
+    assert np.allclose(read_all(open_depth_maps(tmp_path / "depth", room, "m")), truth)

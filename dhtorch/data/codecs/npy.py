@@ -64,6 +64,15 @@ def parse_real_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
     return header
 
 
+def read_real_npy(file: Path, field: str) -> np.ndarray:
+    """Array of real numbers in an ``.npy`` file as floating point; pickled objects are refused.
+
+    Raises:
+        FormatError: missing file, damaged header, not numeric, or another number of bytes than the header claims.
+    """
+    return _decode_real_npy(file, field, read_bytes(file))
+
+
 def _decode_real_npy(file: Path, field: str, raw: bytes) -> np.ndarray:
     """The bytes of an ``.npy`` file of real numbers as floating point.
 
@@ -98,6 +107,8 @@ def read_npz(file: Path, key: str) -> np.ndarray:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if f"{key}.npy" not in archive.namelist():
                 raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
+            if (count := archive.namelist().count(f"{key}.npy")) > 1:
+                raise FormatError(file, "key", f"{count} members {key}.npy", "one")
             member = archive.getinfo(f"{key}.npy")
             if member.file_size > MAX_FILE_BYTES:
                 raise FormatError(

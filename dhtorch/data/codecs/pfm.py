@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
     """One-channel portable float map (h, w) float32, first row on top (the file stores the last row first).
 
     Raises:
-        FormatError: missing or truncated file, colour map, another size than ``hw``.
+        FormatError: missing or truncated file, colour map, scale 0 or not finite, another size than ``hw``.
     """
     data = read_bytes(file)
     head = data[:128].split(b"\n", 3)
@@ -24,6 +25,8 @@ def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
         scale = float(head[2])
     except ValueError:
         raise FormatError(file, "header", repr(b" ".join(head[1:3])), "width, height and scale") from None
+    if scale == 0 or not math.isfinite(scale):
+        raise FormatError(file, "scale", scale, "a number below 0 (little endian) or above (big endian)")
     size = (h, w)
     if hw is not None and size != tuple(hw):
         raise FormatError(file, "size", f"{w}x{h}", f"{hw[1]}x{hw[0]}")
