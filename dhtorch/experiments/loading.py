@@ -1,9 +1,10 @@
-"""Pairs of a recording, loaded in batches for a protocol."""
+"""Pairs of a recording, loaded in batches for a protocol, and chunks of frames for the probes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -75,6 +76,81 @@ def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[Loa
         # A fork would copy locks held by threads of torch and OpenCV in this process, and may deadlock.
         multiprocessing_context="spawn" if workers else None,
     )
+
+
+class FrameChunk(NamedTuple):
+    """Frames of one recording that go through one forward pass: rows of positions, such as (frame, second view)."""
+
+    recording: Recording
+    rows: Sequence[tuple[int, ...]]
+    truth: bool = False  # also the true depth of the first frame of each row; the recording is a TruthRecording
+
+
+#: Rows of frames, and by row the true depth (1, H, W) of its first frame, empty without truth.
+LoadedChunk = tuple[list[tuple[Frame, ...]], list[Tensor]]
+
+
+class ChunkDataset(Dataset[LoadedChunk]):
+    """Data set of chunks of frames, of any recordings; a position is read once per chunk."""
+
+    def __init__(self, chunks: Sequence[FrameChunk], dtype: torch.dtype) -> None:
+        self.chunks, self.dtype = chunks, dtype
+
+    def __len__(self) -> int:
+        return len(self.chunks)
+
+    def __getitem__(self, index: int) -> LoadedChunk:
+        recording, rows, with_truth = self.chunks[index]
+        frames = {k: recording[k].to(self.dtype) for k in sorted({k for row in rows for k in row})}
+        truth: list[Tensor] = []
+        if with_truth and isinstance(recording, TruthRecording):
+            truth = [recording.truth(row[0])["depth"].to(self.dtype) for row in rows]
+        return [tuple(frames[k] for k in row) for row in rows], truth
+
+
+class ChunkReader:
+    """Reads groups of chunks in order, in ``workers`` processes that start once for all of them (0: in this process).
+
+    Args:
+        groups: number of a group, such as those of one shard of features -> its chunks; in the order of reading.
+        dtype: of the frames.
+        workers: number of processes.
+    """
+
+    def __init__(self, groups: Mapping[int, Sequence[FrameChunk]], dtype: torch.dtype, workers: int) -> None:
+        ends = itertools.accumulate(map(len, groups.values()))
+        self._spans = {k: (end - len(groups[k]), end) for k, end in zip(groups, ends, strict=True)}
+        data = ChunkDataset([chunk for chunks in groups.values() for chunk in chunks], dtype)
+        workers = min(workers, len(data))
+        self._loader = iter(
+            DataLoader(
+                data,
+                batch_size=None,
+                num_workers=workers,
+                collate_fn=_unchanged,
+                worker_init_fn=_init_worker,
+                multiprocessing_context="spawn" if workers else None,
+            )
+        )
+        self._n_read = 0
+
+    def length(self, group: int) -> int:
+        """Number of chunks of a group."""
+        start, end = self._spans[group]
+        return end - start
+
+    def read(self, group: int) -> Iterator[LoadedChunk]:
+        """Chunks of a group; those of earlier groups that were not read are skipped."""
+        start, end = self._spans[group]
+        while self._n_read < end:
+            chunk = next(self._loader)
+            self._n_read += 1
+            if self._n_read > start:
+                yield chunk
+
+
+def _unchanged(item: Any) -> Any:
+    return item
 
 
 def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | None) -> Sequence[int]:

@@ -197,6 +197,11 @@ def load_network_front_ends(
     return front_ends, origin
 
 
+def with_true_depth(frame: Frame, depth: Tensor) -> Frame:
+    """Frame whose sensor is replaced by the true depth (1, H, W) m at every pixel of its image."""
+    return frame.replace(depth=depth, depth_camera=None, conf=None)
+
+
 def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
     """Depth tokens of a method with the track hint and sparsity of a scene."""
     return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)

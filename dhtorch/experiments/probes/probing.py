@@ -4,9 +4,10 @@ A *shard* holds the samples of one group as blocks of features side by side: ``c
 and one block per front end. An *arm* is the context and a subset of the blocks. Features are computed once and read
 again shard by shard; over all samples only means and scatter matrices are held in memory.
 
-Two arms are controls: ``true_motion`` has the target itself with noise (it must beat the context, or the samples are
-too few to decode anything), ``shuffled`` the depth features of another group (it must not beat the context, or the
-split leaks). No verdict without both.
+Arms that are controls: ``true_motion`` has the target itself with noise (it must beat the context, or the samples are
+too few to decode anything); ``true_depth``, where a set has it, the depth tokens of the true depth, pooled as the
+method's (it must beat the context on groups not trained on, or depth tells nothing of the target there); ``shuffled``
+the depth features of another group (it must not beat the context, or the split leaks). No verdict without them.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ PROBE_METRICS = (
 CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK, EFFICIENTNET_BLOCK = "context", "dinov2", "xfeat", "efficientnet"
 
 #: Blocks and arms of the controls.
-POSITIVE_CONTROL, NEGATIVE_CONTROL = "true_motion", "shuffled"
+POSITIVE_CONTROL, DEPTH_CONTROL, NEGATIVE_CONTROL = "true_motion", "true_depth", "shuffled"
 
 #: Block whose features the negative control takes from another group.
 _SHUFFLED_BLOCK = "depth"
 
-#: Noise of the positive control, in standard deviations of the targets of a group.
+#: Noise of the positive control, in standard deviations of the targets over all groups.
 #: Source: derived, a linear probe of it has an error of .3² / (1 + .3²) = .08 of the variance.
 CONTROL_NOISE = 0.3
 
@@ -68,6 +69,7 @@ PROBE_ARMS: dict[str, tuple[str, ...]] = {
     EFFICIENTNET_BLOCK: ("efficientnet",),
     "dhtorch + efficientnet": ("depth", "efficientnet"),
     POSITIVE_CONTROL: (POSITIVE_CONTROL,),
+    DEPTH_CONTROL: (DEPTH_CONTROL,),
     NEGATIVE_CONTROL: (NEGATIVE_CONTROL,),
 }
 
@@ -112,6 +114,7 @@ class ProbeShards:
         self._folder = Path(self._temporary.name if self._temporary else str(folder))
         self._folder.mkdir(parents=True, exist_ok=True)
         self._files: list[tuple[str, Path]] = []
+        self._targets: probe.SampleMoments | None = None
         self.widths: dict[str, int] = {}
         self.n = 0
 
@@ -127,22 +130,38 @@ class ProbeShards:
         Raises:
             ValueError: the blocks differ from those of the earlier shards.
         """
-        text = re.sub(r" at 0x[0-9a-f]+", "", repr((group, key)))
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        file = self._folder / f"{digest}.pt"
+        file = self._file(group, key)
         if not file.is_file():
             shard = make()
             partial_file = file.with_suffix(f".{os.getpid()}.partial")
             torch.save({**shard.__dict__, "blocks": dict(shard.blocks)}, partial_file)
             partial_file.replace(file)
         shard = self._load(file)
-        widths = {name: block.shape[-1] for name, block in shard.blocks.items()}
-        known = {name: width for name, width in self.widths.items() if name != NEGATIVE_CONTROL}
+        widths = {name: block.shape[-1] for name, block in shard.blocks.items() if name != POSITIVE_CONTROL}
+        known = {k: width for k, width in self.widths.items() if k not in (POSITIVE_CONTROL, NEGATIVE_CONTROL)}
         if known and widths != known:
             raise ValueError(f"probe: group {group} has blocks {widths}, expected {known} as in the earlier groups")
-        self.widths = widths | ({NEGATIVE_CONTROL: widths[_SHUFFLED_BLOCK]} if _SHUFFLED_BLOCK in widths else {})
+        self.widths = {**widths, POSITIVE_CONTROL: shard.target.shape[-1]}
+        if _SHUFFLED_BLOCK in widths:
+            self.widths[NEGATIVE_CONTROL] = widths[_SHUFFLED_BLOCK]
+        moments = probe.compute_moments(shard.target[:, :0], shard.target)
+        self._targets = moments if self._targets is None else probe.join_moments(self._targets, moments)
         self._files.append((group, file))
         self.n += len(shard.target)
+
+    def missing(self, entries: Sequence[tuple[str, object]]) -> list[bool]:
+        """Whether the shard of each (group, key) would be computed if they were added in this order."""
+        known: set[Path] = set()
+        result = []
+        for group, key in entries:
+            file = self._file(group, key)
+            result.append(file not in known and not file.is_file())
+            known.add(file)
+        return result
+
+    def _file(self, group: str, key: object) -> Path:
+        text = re.sub(r" at 0x[0-9a-f]+", "", repr((group, key)))
+        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.pt"
 
     @staticmethod
     def _load(file: Path) -> ProbeShard:
@@ -154,19 +173,29 @@ class ProbeShards:
         return list(dict.fromkeys(group for group, _ in self._files))
 
     def read(self, groups: Sequence[str]) -> Iterator[ProbeShard]:
-        """Load the shards of the named groups, one after another."""
+        """Load the shards of the named groups, one after another, with the blocks of the controls."""
         wanted = set(groups)
         for k, (group, file) in enumerate(self._files):
             if group in wanted:
-                yield self._with_negative_control(self._load(file), k)
+                yield self._with_controls(self._load(file), k)
 
-    def _with_negative_control(self, shard: ProbeShard, k: int) -> ProbeShard:
-        """Shard ``k`` with the depth features of the shard half of all shards away: of other samples, elsewhere."""
-        if NEGATIVE_CONTROL not in self.widths:
-            return shard
-        other = self._load(self._files[(k + len(self._files) // 2) % len(self._files)][1]).blocks[_SHUFFLED_BLOCK]
-        rows = torch.arange(len(shard.target)) % max(len(other), 1)
-        return replace(shard, blocks={**shard.blocks, NEGATIVE_CONTROL: other[rows]})
+    def target_spread(self) -> Tensor:
+        """Standard deviations (D,) of the targets over all samples; 1 for a constant target."""
+        if self._targets is None:
+            raise ValueError("probe: found no sample")
+        variance = self._targets.yy / self._targets.n.clamp_min(1)
+        return torch.where(variance > 0, variance, 1.0).sqrt()
+
+    def _with_controls(self, shard: ProbeShard, k: int) -> ProbeShard:
+        """Shard ``k`` with ``true_motion``, its targets with noise, and ``shuffled``, the depth features of the shard
+        half of all shards away: of other samples, elsewhere."""
+        generator = torch.Generator().manual_seed(k)
+        noise = torch.randn(shard.target.shape, generator=generator, dtype=torch.float64)
+        blocks = {**shard.blocks, POSITIVE_CONTROL: shard.target + CONTROL_NOISE * self.target_spread() * noise}
+        if NEGATIVE_CONTROL in self.widths:
+            other = self._load(self._files[(k + len(self._files) // 2) % len(self._files)][1]).blocks[_SHUFFLED_BLOCK]
+            blocks[NEGATIVE_CONTROL] = other[torch.arange(len(shard.target)) % max(len(other), 1)]
+        return replace(shard, blocks=blocks)
 
     def columns(self, blocks: Sequence[str]) -> Tensor:
         """Column indices of the named blocks among all features: (f,) int64."""
@@ -187,14 +216,6 @@ class ProbeShards:
 def split_into_chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
     """Consecutive parts of at most ``n`` items, for one forward pass each."""
     return [items[k : k + max(1, n)] for k in range(0, len(items), max(1, n))]
-
-
-def add_positive_control(blocks: Mapping[str, Tensor], target: Tensor, seed: int) -> dict[str, Tensor]:
-    """The blocks with ``true_motion`` (n, D): the target (n, D) with :data:`CONTROL_NOISE`, from ``seed``."""
-    generator = torch.Generator().manual_seed(seed)
-    spread = target.std(0, unbiased=False) if len(target) else target.new_zeros(target.shape[-1])
-    noise = torch.randn(target.shape, generator=generator, dtype=target.dtype)
-    return {**blocks, POSITIVE_CONTROL: target + CONTROL_NOISE * spread * noise}
 
 
 @dataclass
@@ -258,7 +279,7 @@ def evaluate_probes(
             (arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *predictions)
         }
     grid = torch.tensor(list(penalties), dtype=torch.float64)
-    scale = _target_spread(shards)
+    scale = shards.target_spread()
     for fold in probe.make_folds(groups, n_folds, seed=seed):
         fitted = _fit_fold(shards, fold, arms, grid, scale)
         for arm, (_, _, chosen) in fitted.probes.items():
@@ -294,18 +315,6 @@ class _FittedFold:
 def scaled_squared_error(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
     """Squared errors (…, n) of predictions (…, n, D) in units of ``scale`` (D,), mean over the targets."""
     return ((answer.double() - target.double()) / scale).square().mean(-1)
-
-
-def _target_spread(shards: ProbeShards) -> Tensor:
-    """Standard deviations (D,) of the targets over all samples; 1 for a constant target."""
-    total = None
-    for shard in shards.read(shards.groups):
-        moments = probe.compute_moments(shard.target[:, :0], shard.target)
-        total = moments if total is None else probe.join_moments(total, moments)
-    if total is None:
-        raise ValueError("probe: found no sample")
-    variance = total.yy / total.n.clamp_min(1)
-    return torch.where(variance > 0, variance, 1.0).sqrt()
 
 
 def _fit_fold(
@@ -361,15 +370,26 @@ def _choose_penalties(
     return chosen
 
 
-def check_controls(positive: Interval, negative: Interval) -> str | None:
-    """Reason why the controls allow no verdict, from the intervals of their ratios to the context; None = they do."""
-    if positive.value is None or negative.value is None:
+def check_controls(positive: Interval, negative: Interval, depth: Interval | None = None) -> str | None:
+    """Reason why the controls allow no verdict, from the intervals of their ratios to the context; None = they do.
+
+    ``depth``: of the true depth's tokens; None = the set has no true depth.
+    """
+    if positive.value is None or negative.value is None or (depth is not None and depth.value is None):
         return "the controls have no ratio"
-    if not (positive.high if positive.high is not None else positive.value) < 1:
+    if not _beats_context(positive):
         return f"the positive control does not beat the context ({format_ratio(positive)})"
-    if (negative.high if negative.high is not None else negative.value) < 1:
+    if depth is not None and not _beats_context(depth):
+        return f"the true depth's tokens do not beat the context ({format_ratio(depth)})"
+    if _beats_context(negative):
         return f"shuffled depth features beat the context ({format_ratio(negative)})"
     return None
+
+
+def _beats_context(ratio: Interval) -> bool:
+    """Whether the interval of a ratio to the context, or the ratio if it has none, lies below 1."""
+    bound = ratio.value if ratio.high is None else ratio.high
+    return bound is not None and bound < 1
 
 
 def describe_error(error: float | None, vs_context: Interval) -> str:

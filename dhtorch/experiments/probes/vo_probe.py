@@ -17,7 +17,7 @@ which say nothing about DINOv2. An undecided ratio comes with the number of room
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -27,10 +27,12 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
+    DEPTH_CONTROL,
     EFFICIENTNET_BLOCK,
     NEGATIVE_CONTROL,
     POSITIVE_CONTROL,
@@ -47,6 +49,7 @@ from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, 
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 from dhtorch.metrics.bootstrap import Interval
+from dhtorch.records import Frame
 
 QUESTION = "Within one scene, do depth features tell a ridge probe more of the camera's motion than DINOv2's do?"
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
@@ -96,7 +99,8 @@ def run(
         scenes: with poses; those without, with a role, or of rooms with few pairs are left out, with a note.
         methods: name → method; the first fills the depth tokens.
         pairs: not used: every frame starts a pair, to have enough samples.
-        settings: of the job; the method sees all returns; ``batch`` pairs or pictures per forward pass.
+        settings: of the job; the method sees all returns; ``batch`` pairs or pictures per forward pass, on ``device``,
+            of frames that ``workers`` processes read.
         hold_out: ``blocks`` of a room, each room with probes of its own; or ``rooms``, with probes that all share.
         gap_parts: the frames of a pair are the scene's own gap divided by this apart, at least one frame.
         blocks: consecutive parts of a scene, at least three; split evenly over the scenes of a room.
@@ -122,7 +126,7 @@ def run(
     networks, origin = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, efficientnet_too=efficientnet, device=settings.device
     )
-    left_out = {XFEAT_BLOCK: not xfeat, EFFICIENTNET_BLOCK: not efficientnet}
+    left_out = {XFEAT_BLOCK: not xfeat, EFFICIENTNET_BLOCK: not efficientnet, DEPTH_CONTROL: True}
     arm_names = [*(a for a, names in PROBE_ARMS.items() if not any(left_out.get(n) for n in names)), _POSE_ARM]
     extractor = _PairFeatures(
         settings, next(iter(methods.values())), networks, cells=depth_cells, rgb_side=rgb_side, origin=origin
@@ -142,11 +146,13 @@ def run(
     needed: dict[str, int | None] = {}
     for name, members_blocks in probed.items():
         with ProbeShards(features) as shards:
-            for scene, scene_blocks in members_blocks:
-                for k, block in enumerate(scene_blocks):
-                    if block:
-                        group = scene.place if hold_out == "rooms" else f"{scene.name} {k}"
-                        extractor.add(shards, group, scene, block, moving, progress)
+            parts = [
+                (scene.place if hold_out == "rooms" else f"{scene.name} {k}", scene, block)
+                for scene, scene_blocks in members_blocks
+                for k, block in enumerate(scene_blocks)
+                if block
+            ]
+            extractor.add(shards, parts, moving, progress)
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
             options: dict[str, Any] = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
             errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
@@ -247,34 +253,57 @@ class _PairFeatures:
     def add(
         self,
         shards: ProbeShards,
+        parts: Sequence[tuple[str, Scene, Sequence[tuple[int, int]]]],
+        moving: float,
+        progress: Progress,
+    ) -> None:
+        """Add the shards of blocks of pairs (group, scene, block): features, motions, and whether each moves more than
+        ``moving`` m."""
+        common = (self.method, self.cells, self.rgb_side, self.origin, sorted(self.networks), self.settings.seed)
+        keys = [(group, (s.name, len(s.recording), list(block), moving, *common)) for group, s, block in parts]
+        wanted = [k for k, missing in enumerate(shards.missing(keys)) if missing]
+        reader = self._reader({k: parts[k] for k in wanted})
+        for k, ((group, key), (_, scene, block)) in enumerate(zip(keys, parts, strict=True)):
+            make = partial(self._make_shard, group, scene, block, moving, progress, partial(reader.read, k))
+            shards.add(group, key, make)
+
+    def _reader(self, parts: Mapping[int, tuple[str, Scene, Sequence[tuple[int, int]]]]) -> loading.ChunkReader:
+        """Reader of the frames of numbered blocks, each frame once, ``settings.batch`` at once."""
+        groups = {
+            k: [
+                loading.FrameChunk(scene.recording, [(i,) for i in positions])
+                for positions in probing.split_into_chunks(_positions(block), self.settings.batch)
+            ]
+            for k, (_, scene, block) in parts.items()
+        }
+        return loading.ChunkReader(groups, self.settings.dtype, self.settings.workers)
+
+    def _make_shard(
+        self,
         group: str,
         scene: Scene,
         block: Sequence[tuple[int, int]],
         moving: float,
         progress: Progress,
-    ) -> None:
-        """Add the shard of one block of pairs: features, motions, and whether each moves more than ``moving`` m."""
-        source = (scene.name, len(scene.recording), list(block), moving)
-        key = (*source, self.method, self.cells, self.rgb_side, self.origin, sorted(self.networks), self.settings.seed)
-
-        def make() -> ProbeShard:
-            i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
-            poses = scene.recording.poses
-            assert poses is not None  # scenes without poses have no blocks
-            target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
-            features = probing.add_positive_control(self._features(scene, block, progress), target, self.settings.seed)
-            blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **features}
-            return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)
-
-        shards.add(group, key, make)
+        read: Callable[[], Iterable[loading.LoadedChunk]],
+    ) -> ProbeShard:
+        """Shard of one block of pairs."""
+        i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
+        poses = scene.recording.poses
+        assert poses is not None  # scenes without poses have no blocks
+        target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
+        in_order = [frame.to(self.settings.device) for rows, _ in read() for (frame,) in rows]
+        frames = dict(zip(_positions(block), in_order, strict=True))
+        features = self._features(scene, block, frames, progress)
+        blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **features}
+        return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)
 
     @torch.no_grad()
-    def _features(self, scene: Scene, block: Sequence[tuple[int, int]], progress: Progress) -> dict[str, Tensor]:
+    def _features(
+        self, scene: Scene, block: Sequence[tuple[int, int]], frames: Mapping[int, Frame], progress: Progress
+    ) -> dict[str, Tensor]:
         """Features (n, F) of the pairs by block of features: frame ``i``, then ``j`` minus ``i``."""
         settings = self.settings
-        frames = {
-            k: scene.recording[k].to(settings.dtype).to(settings.device) for k in sorted({k for p in block for k in p})
-        }
         two_view, one_view = (
             front_ends.depth_tokens_for_scene(self.method, scene, cells=self.cells, seed=settings.seed, views=v)
             for v in (2, 1)
@@ -303,6 +332,11 @@ class _PairFeatures:
             own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
         depth = torch.cat(forth)
         return {**features, "depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
+
+
+def _positions(block: Sequence[tuple[int, int]]) -> list[int]:
+    """Positions of the frames of a block of pairs, each once, in order."""
+    return sorted({k for pair in block for k in pair})
 
 
 def _motion_vectors(T: Tensor) -> Tensor:
