@@ -421,7 +421,7 @@ SMALLER = {
     "method_comparison": ["experiment.seeds=1"],
     "part_ablation": ["experiment.seeds=1"],
     "rh20t_probe": [
-        *("data=rh20t_synthetic", "data.hw=[72,128]", "data.tasks=3", "data.n_frames=12"),
+        *("data=rh20t_synthetic", "data.hw=[72,128]", "data.tasks=3", "data.scenes=1"),
         *("experiment.dinov2=null", "experiment.n_folds=3"),
     ],
     "views_study": [
