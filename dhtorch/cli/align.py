@@ -26,7 +26,6 @@ from dhtorch.cli.layouts import select_layout
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.data import depth_maps
 from dhtorch.data.depth_maps import DepthMaps
-from dhtorch.data.io import decode as data_files
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.metrics.holdout import range_split
@@ -101,9 +100,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
     limits = _check_options(settings)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        data_files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     if len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")

@@ -24,7 +24,6 @@ from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.completed_folder import EXTRA_FILES, CompletionTask, Row
 from dhtorch.cli.layouts import FRAME_LAYOUTS, has_varying_camera, select_layout, stray_confidence
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.data.io import decode as data_files
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
@@ -89,9 +88,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
     _check_options(settings)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        data_files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     out = Path(str(settings["out"])).expanduser()
     with open_output_folder(out, "out") if len(scenes) > 1 else contextlib.nullcontext():

@@ -29,7 +29,6 @@ from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
 from dhtorch.codes import Source
 from dhtorch.data import FORMATS, FormatError, open_all
 from dhtorch.data.foreign_files import NEEDS_DEPTH, PHONE_EXPORTS
-from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.experiments.focal.image_folder import list_camera_files
@@ -110,9 +109,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data, or nothing can be recovered.
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        files.set_opencv_threads(settings["threads"])
     file_from_world(settings["axes"], (0.0, 1.0, 0.0))  # refuses other axes before the computation
     path = Path(str(settings["path"])).expanduser()
     reader_options = {name: value for name, value in settings["data"].items() if value is not None}

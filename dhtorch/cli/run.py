@@ -156,6 +156,7 @@ def _dispatch(argv: list[str]) -> int:
     argv = commands.to_overrides(name, typed, known, flags, console.suggest_name)
     if name in _PARSED_COMMANDS:
         parsed = commands.to_parser_arguments(argv, known)
+        _set_threads(1)
         return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
     if name == "run":
         argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
@@ -211,6 +212,7 @@ def _run_demo(argv: list[str]) -> int:
     words.validate_words(rest, ())
     from dhtorch.cli import demo  # noqa: PLC0415
 
+    _set_threads(1)
     capture, out = demo.write_demo_capture(Path(options["out"]))
     code = _run_configured("recover", [str(capture), f"out={quote_value(str(out))}", *rest])
     if code == EXIT_DONE:
@@ -281,12 +283,24 @@ def _run_configured(word: str, argv: list[str]) -> int:
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     disable_malloc_trim()
     try:
+        _set_threads(settings.get("threads"))
         if "data" in parts:
             parts["data"] = _prepare_data(word, settings, parts["data"])
         with console.mute_if_quiet():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or EXIT_DONE)
     except errors.USER_ERRORS as error:
         return _report_failure(error, show=settings.get("traceback", False))
+
+
+def _set_threads(threads: int | None) -> None:
+    """Set the threads of torch and OpenCV; None keeps their defaults. Beside other work more than one thread spins."""
+    import torch  # noqa: PLC0415
+
+    from dhtorch.data.io.decode import set_opencv_threads  # noqa: PLC0415
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+        set_opencv_threads(threads)
 
 
 def _prepare_data(name: str, settings: Mapping[str, Any], data: Any) -> Any:

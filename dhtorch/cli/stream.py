@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from dhtorch.data.io import decode as files
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.method import Method
@@ -32,9 +31,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     """
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        files.set_opencv_threads(settings["threads"])
     path = Path(settings["output"]) / "stream.json"
     with open_output_folder(path.parent, "output") as folder:
         folder.check([path])

@@ -22,7 +22,6 @@ from dhtorch.codes import State, WrongCause, names, words
 from dhtorch.data import depth_maps
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.depth_maps import DepthMaps
-from dhtorch.data.io import decode as files
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.metrics.holdout import range_split
@@ -104,9 +103,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data.
     """
     limits = _check_options(settings)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")

@@ -42,8 +42,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     for name, endings in ((page, html.HTML_SUFFIXES), (recording, rrd.RRD_SUFFIXES)):
         if name is not None and (Path(name).is_dir() or Path(name).suffix.lower() not in endings):
             raise ValueError(f"{name}: expected a file name that ends in {endings[0]}")
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
     target = None if settings["result"] is None else Path(settings["result"])
     folder = Path(settings["output"]) if target is None else target if target.is_dir() else target.parent
     notes: list[str] = []

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dhtorch import export, integrate
 from dhtorch.codes import Source, names, words
-from dhtorch.data.io import decode as data_files
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
@@ -96,9 +95,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         KeyboardInterrupt: Ctrl-C; files of finished scenes are kept.
     """
     _check_settings(settings)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        data_files.set_opencv_threads(settings["threads"])
     sources = scenes_of(parts["data"])
     folder = Path(settings["output"])
     with open_output_folder(folder, "output") as output:

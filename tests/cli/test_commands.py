@@ -202,6 +202,28 @@ def test_the_cutoff_lies_among_the_returns(monkeypatch):
         assert depth <= float(f"{cutoff:g}") < 1.11 * depth, depth
 
 
+def test_every_command_computes_with_the_threads_of_its_settings(command, monkeypatch, tmp_path):
+    """Commands without the option have one: beside other work torch's further threads spin."""
+    torch = pytest.importorskip("torch")
+    seen, before = [], torch.get_num_threads()
+    record = SimpleNamespace(
+        run=lambda *_, **__: seen.append(torch.get_num_threads()), main=lambda _: seen.append(torch.get_num_threads())
+    )
+    monkeypatch.setattr(run, "importlib", SimpleNamespace(import_module=lambda _: record))
+    monkeypatch.setattr(
+        demo, "write_demo_capture", lambda _: seen.append(torch.get_num_threads()) or (tmp_path, tmp_path / "out")
+    )
+    monkeypatch.setattr(demo, "open_page", lambda *_, **__: None)
+    try:
+        for words in (["inspect", "."], ["report", "."], ["stream", "data=synthetic"], ["demo"]):
+            torch.set_num_threads(2)
+            assert command(*words)[0] == 0
+        assert seen == [1] * 5
+        assert command("stream", "data=synthetic", "threads=2")[0] == 0 and seen[5:] == [2]
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_a_list_of_settings_files_is_read(tmp_path):
     file = tmp_path / "x.yaml"
     file.write_text("defaults:\n  - method: map\na: 1 # one\nb:\n  c: [1, 2] # two\nd: null\nhydra:\n  e: 3\n")
