@@ -57,6 +57,9 @@ _OPTION_RANGES = {
     "max_sigma_rel": (0, math.inf),
 }
 
+#: Pixels per inch of the figures of ``previews/``, about 1000 px wide. Source: chosen for an eighth of a figure's size.
+_PREVIEW_DPI = 100.0
+
 #: Source name in a meta file → name in printed text.
 _SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "no answer"}
 
@@ -237,7 +240,7 @@ def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: Dept
     steps = export.quantise_depth(depth_map.depth, depth_map.sigma, depth_map.source, layout.unit)
     pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
     if layout.pictures:
-        pictures[layout.pictures] = _resize_picture(reference, steps.depth.shape)
+        pictures[layout.pictures] = resize_picture(reference, steps.depth.shape)
     if layout.confidence:
         pictures["confidence"] = stray_confidence(steps.source)
     if not (shared_file := task.folder / "complete.json").is_file():
@@ -282,7 +285,7 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
 
 
-def _resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
+def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
     """Frame image -> (h, w, 3) or (h, w) uint8 at the map's size, by area averaging."""
     image = frame.image[0].cpu()
     if image.is_floating_point():
@@ -310,20 +313,23 @@ def _write_extras(task: CompletionTask, i: int) -> None:
         return
     maps, source = completed.read_completed_maps(task, i)
     frame = task.recording[i]
-    picture = _resize_picture(frame, source.shape)
+    picture = resize_picture(frame, source.shape)
     for path in missing:
         if path.suffix == ".png":
-            storage.replace_file(path, render_completed(task, i, frame, maps, source))
+            storage.replace_file(path, _render_completed(task, i, frame.image[0], maps, source))
+        elif path.suffix == ".jpg":
+            small = np.atleast_3d(picture).transpose(2, 0, 1)
+            storage.replace_file(path, _render_completed(task, i, small, maps, source, dpi=_PREVIEW_DPI, kind="jpg"))
         else:
             _write_points(path, frame, picture, **maps, source=source)
 
 
-def render_completed(
-    task: CompletionTask, i: int, frame: Frame, maps: Mapping[str, np.ndarray], source: np.ndarray
+def _render_completed(
+    task: CompletionTask, i: int, image: Any, maps: Mapping[str, np.ndarray], source: np.ndarray, **options: Any
 ) -> bytes:
-    """The figure of a complete frame as PNG; ``maps`` and ``source`` from ``read_completed_maps``."""
+    """The figure of a complete frame; ``maps`` and ``source`` from ``read_completed_maps``, options of the drawing."""
     out = io.BytesIO()
-    draw_completed(out, frame.image[0], **maps, source=source, title=completed.format_frame_title(task, i))
+    draw_completed(out, image, **maps, source=source, title=completed.format_frame_title(task, i), **options)
     return out.getvalue()
 
 
@@ -378,7 +384,7 @@ def _check_options(settings: Mapping[str, Any]) -> None:
     choices_of = {
         "format": ("auto", *FRAME_LAYOUTS),
         "dtype": ("float32", "float64"),
-        **dict.fromkeys(EXTRA_FILES, _EXTRAS_CHOICES),
+        **dict.fromkeys(EXTRA_FILES.keys() & settings.keys(), _EXTRAS_CHOICES),
     }
     for name, choices in choices_of.items():
         if settings[name] not in choices:

@@ -32,7 +32,7 @@ Row = dict[str, Any]
 _FORMAT_VERSION = 1
 
 #: Folder of derived files → their suffixes.
-EXTRA_FILES = {"figures": (".png",), "points": (".ply", ".glb")}
+EXTRA_FILES = {"figures": (".png",), "previews": (".jpg",), "points": (".ply", ".glb")}
 
 #: Names of the sources of a pixel whose depth is estimated from images, in a frame's meta file.
 ESTIMATED = ("swept", "recovered", "filled")
@@ -64,7 +64,8 @@ class CompletionTask:
     def extras(self, i: int) -> list[Path]:
         """Requested figure and point files of frame ``i``: of all frames, or of the first one with a source view."""
         first = next((k for k in self.frames if k in self.offers), self.frames[0])
-        kinds = [kind for kind in EXTRA_FILES if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
+        chosen = {kind: self.settings.get(kind, False) for kind in EXTRA_FILES}
+        kinds = [kind for kind, which in chosen.items() if which == "all" or (which and i == first)]
         return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRA_FILES[kind]]
 
     def files(self, i: int) -> list[Path]:
@@ -188,7 +189,7 @@ def _adopt_older_version(task: CompletionTask, folder: OutputFolder) -> None:
 
 def _check_files(task: CompletionTask, folder: OutputFolder, more: Iterable[str]) -> None:
     """Raise FileExistsError for a link or a foreign file where the command writes."""
-    extras = [kind for kind in EXTRA_FILES if task.settings[kind]]
+    extras = [kind for kind in EXTRA_FILES if task.settings.get(kind)]
     folder.check_folders(task.folder / kind for kind in (*task.layout.folders, *extras))
     folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
     for i in task.frames:
@@ -215,9 +216,8 @@ def _read_meta(task: CompletionTask, path: Path) -> Row | None:
 
 
 def format_frame_title(task: CompletionTask, i: int) -> str:
-    """Figure title: scene, frame, source views, cutoff."""
-    row = task.done[task.name(i)]
-    return append_cutoff(format_frame(task.scene.name, row["frame"], row.get("views", ())), task.settings["cutoff"])
+    """Figure title: capture, frame, cutoff."""
+    return append_cutoff(format_frame(task.scene.name, task.done[task.name(i)]["frame"]), task.settings["cutoff"])
 
 
 def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:

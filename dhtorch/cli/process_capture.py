@@ -1,6 +1,7 @@
 """``dhtorch PATH``: a capture -> completed depth maps, one fused map and a viewer page.
 
-Frames are completed as in ``dhtorch complete``, coarse to fine in time, until the time limit; a second run continues.
+Frames are completed as in ``dhtorch complete``, at any time evenly spread over the capture, until the time limit; a
+second run continues.
 A capture from which nothing can be recovered gives one sentence with the reason and the remedy.
 """
 
@@ -20,12 +21,13 @@ import numpy as np
 import torch
 
 from dhtorch import export
-from dhtorch.cli import complete, recover_page
+from dhtorch.cli import complete, recover_page, recover_pictures
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.capture_checks import describe_missing_depth, print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
+from dhtorch.cli.recover_pictures import CONTACT_SHEET, PREVIEW_VIDEO
 from dhtorch.codes import Source
 from dhtorch.data import FORMATS, FormatError, open_all
 from dhtorch.data.foreign_files import NEEDS_DEPTH, PHONE_EXPORTS
@@ -38,17 +40,17 @@ from dhtorch.integrate.mapping import choose_voxel, file_from_world, should_mesh
 from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Pose
-from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation.capture_check import CaptureCheck, check_capture
+from dhtorch.viz.plots import format_capture_name
 from dhtorch.viz.viewer import html, points
 from dhtorch.viz.viewer.exhibit import PageOpening
 
 #: Default output folder.
 _DEFAULT_FOLDER = Path("dhtorch_out")
 
-#: Maximum number of frames in the fused map; taken coarse to fine, further frames show the same surfaces.
+#: Maximum number of frames in the fused map; evenly spread, further frames show the same surfaces.
 _MAX_MAPPED_FRAMES = 40
 
 #: Frames tried for a readable one with depth before a recording is skipped.
@@ -60,6 +62,7 @@ _COMPLETE_DEFAULTS = {
     "unit": None,
     "arrays": False,
     "figures": False,
+    "previews": "all",
     "points": False,
     "max_frames": None,
     "every": 1,
@@ -73,7 +76,7 @@ _CUTOFF_FRAMES = 8
 _DEFAULT_CUTOFF_M = 2.0
 
 #: Files written beside those of ``dhtorch complete``.
-_FURTHER_FILES = ("overview.png", "map.ply", "map.glb", "view.html")
+_FURTHER_FILES = (CONTACT_SHEET, PREVIEW_VIDEO, "map.ply", "map.glb", "view.html")
 
 
 class FoundRecording(NamedTuple):
@@ -92,7 +95,7 @@ class RecoveredFrames:
     """Progress on one recording."""
 
     task: CompletionTask
-    frames: list[int]  # complete frames, coarse to fine
+    frames: list[int]  # complete frames, in the order of processing
     broken: dict[int, str]  # position of an unreadable frame → error
     left: int  # frames left at the time limit
 
@@ -226,13 +229,15 @@ def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
         raise NothingToRecover(f"{capture.path}: depth without images, which tracking requires ({error})") from None
 
 
-def coarse_to_fine(n: int) -> list[int]:
-    """0 … n − 1 ordered so that every prefix is spread evenly: the middle first, then the middle of each half, …"""
-    order, spans = [], [(0, n)]
-    while spans:
-        order += [(a + b) // 2 for a, b in spans if b > a]
-        spans = [half for a, b in spans if b > a for half in ((a, (a + b) // 2), ((a + b) // 2 + 1, b))]
-    return order
+def order_evenly(n: int) -> list[int]:
+    """0 … n − 1 ordered so that the first k are spread evenly for every k, first the middle and both ends.
+
+    The rest is the van der Corput sequence: halves, quarters, eighths …, in bit-reversed order, so that no part of the
+    capture waits for the others. Source: J. G. van der Corput, Verteilungsfunktionen, 1935.
+    """
+    bits = max(n - 1, 0).bit_length()
+    sequence = (int(f"{k:0{bits}b}"[::-1], 2) * n >> bits for k in range(1 << bits)) if bits else range(n)
+    return list(dict.fromkeys([n // 2, 0, n - 1, *sequence] if n else []))
 
 
 def _resolve_folder(path: Path, out: Any) -> Path:
@@ -260,7 +265,7 @@ def _find_usable_frame(recording: Recording) -> int:
         remedy = "recovering depth requires a second view from another position"
         raise NothingToRecover(f"{recording.name}: {format_count(len(recording), 'frame')}; {remedy}")
     causes, n_without_depth = [], 0
-    for k in coarse_to_fine(len(recording))[:_MAX_TRIED_FRAMES]:
+    for k in order_evenly(len(recording))[:_MAX_TRIED_FRAMES]:
         try:
             frame = recording[k]
         except FormatError as error:
@@ -307,7 +312,7 @@ def _process_recording(
         completed.digest_scene_files(scene, complete_settings, folder),
         sized_as=usable,
     )
-    order = [i for i in coarse_to_fine(len(recording)) if i in task.offers and i % settings["every"] == 0]
+    order = [i for i in order_evenly(len(recording)) if i in task.offers and i % settings["every"] == 0]
     order = order[: settings["max_frames"]]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     with completed.open_task_folder(task, _FURTHER_FILES):
@@ -323,8 +328,6 @@ def _recover_task(
     if not recovered.frames:
         reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")
         raise NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
-    rows = [task.done[task.name(i)] for i in recovered.frames]
-    best = max(zip(rows, recovered.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
     stats = recover_page.measure_recovery(task, recovered.frames)
     placed = _place_frames(recovered)
     lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
@@ -332,11 +335,13 @@ def _recover_task(
     opening = recover_page.build_opening(
         [*recover_page.describe_check(check), *lines],
         stats,
-        _write_overview(task, best),
-        completed.format_frame_title(task, best),
+        *recover_pictures.write_contact_sheet(task, recovered.frames),
     )
-    written = ["depth/", "overview.png", *_write_map(recovered, placed, opening, settings, progress)]
-    return [*lines, _format_next_step(recovered, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
+    written = _write_map(recovered, placed, opening, settings, progress)
+    recover_pictures.write_preview_video(task, recovered.frames, progress)
+    shown = written[-1] if written else CONTACT_SHEET
+    written = ["depth/", "previews/", CONTACT_SHEET, PREVIEW_VIDEO, *written]
+    return [*lines, _format_next_step(recovered, shown), f"Wrote {', '.join(written)} in {folder}."]
 
 
 def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> RecoveredFrames:
@@ -354,11 +359,16 @@ def _complete_in_time(task: CompletionTask, until: float | None, progress: Progr
             yield i
 
     with complete.close_on_exit(task):
-        for i in progress(in_time(), f"{task.scene.name}: frames", len(todo)):
+        for i in progress(in_time(), f"{task.scene.name}: frames{_format_limit(until)}", len(todo)):
             if _try_frame(recovered, i) and is_first:
-                _write_overview(task, i)
+                recover_pictures.write_contact_sheet(task, recovered.frames)
                 is_first = False
     return recovered
+
+
+def _format_limit(until: float | None) -> str:
+    """The time left until a limit, for the progress bar; empty without one."""
+    return "" if until is None else f" (at most {max(0.0, until - time.monotonic()) / 60:.1f} min)"
 
 
 def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
@@ -387,13 +397,6 @@ def _read_error(recording: Recording, k: int) -> str:
     except FormatError as error:
         return str(error)
     return ""
-
-
-def _write_overview(task: CompletionTask, i: int) -> bytes:
-    """Write ``overview.png`` of frame ``i`` (image, sensor depth, completed depth); returns the PNG."""
-    picture = complete.render_completed(task, i, task.recording[i], *completed.read_completed_maps(task, i))
-    storage.replace_file(task.folder / "overview.png", picture)
-    return picture
 
 
 def _place_frames(recovered: RecoveredFrames) -> Recording:
@@ -445,7 +448,8 @@ def _write_map(
     write_surface(ply, surface, f"{task.scene.name}'s {world}", up, turn)
     export.write_glb(task.folder / "map.glb", [surface_shape("map", surface, turn, voxel)], up=(0.0, 1.0, 0.0))
     html.write_viewer_page(
-        task.folder / "view.html", replace(points.read_ply_exhibit(ply), name=task.scene.name, opening=opening)
+        task.folder / "view.html",
+        replace(points.read_ply_exhibit(ply), name=format_capture_name(task.scene.name), opening=opening),
     )
     return ["map.ply", "map.glb", "view.html"]
 
@@ -459,10 +463,15 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
     cause = next(iter(recovered.broken.values()), "")
     broken = f"\n{format_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if recovered.left:
-        left = format_count(recovered.left, "frame")
-        again = f"run the same command again for the {left} left (--minutes null: all at once)"
-        return f"Next: open {shown}; {again}.{broken}"
+        left = f"{recovered.left} of {format_count(len(recovered.task.frames), 'frame')} left at the time limit"
+        return f"Next: open {shown}; {left}, to complete them: {_format_same_command(recovered)}{broken}"
     return f"Next: open {shown}; to measure the error on your capture: {_format_run_command(recovered)}{broken}"
+
+
+def _format_same_command(recovered: RecoveredFrames) -> str:
+    """The command as typed, without its time limit."""
+    typed = recovered.task.settings["typed"]
+    return shlex.join(["dhtorch", *(word for word in typed if not word.startswith("minutes=")), "--minutes", "null"])
 
 
 def _format_run_command(recovered: RecoveredFrames) -> str:

@@ -119,8 +119,8 @@ def describe_placing(check: CaptureCheck, recording: Recording, placed: Recordin
     return [f"The map is joined by the motion that near returns give ({format_count(n, 'frame')}): {why}."]
 
 
-def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes, place: str) -> PageOpening:
-    """The opening of the page; ``picture`` is the PNG of a frame, ``place`` its title."""
+def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes, caption: str) -> PageOpening:
+    """The opening of the page; ``picture`` is the PNG of the contact sheet."""
     shown = {"Recovered pixels per frame": f"{stats.pixels:,.0f}"}
     if stats.error is not None:
         shown |= {"Recovered depth range": f"{stats.near:.1f} – {stats.far:.1f} m"}
@@ -135,8 +135,7 @@ def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes
     reason_lines = (
         [f"Most frequent reasons for no answer: {'; '.join(listed[:_MAX_LISTED_REASONS])}."] if listed else []
     )
-    panels = "image, sensor depth and completed depth on one scale in metres, and sigma / depth"
-    return PageOpening(shown, [*sentences, *reason_lines], picture, f"{place}: {panels}.")
+    return PageOpening(shown, [*sentences, *reason_lines], picture, caption)
 
 
 def _explain_silence(stats: RecoveryStats) -> str:

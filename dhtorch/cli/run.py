@@ -258,6 +258,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
+    typed = sorted(argv, key=lambda each: not _is_positional(each))
     argv = _name_positionals(word, argv)
     if _HYDRA_INFO_FLAGS & {a.split("=")[0] for a in argv}:
         return _show_hydra_info(word, argv)
@@ -286,8 +287,9 @@ def _run_configured(word: str, argv: list[str]) -> int:
         _set_threads(settings.get("threads"))
         if "data" in parts:
             parts["data"] = _prepare_data(word, settings, parts["data"])
+        settings |= {"choices": groups} | ({"typed": typed} if word == "recover" else {})
         with console.mute_if_quiet():
-            return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or EXIT_DONE)
+            return int(module.run(settings, parts, progress=console.progress) or EXIT_DONE)
     except errors.USER_ERRORS as error:
         return _report_failure(error, show=settings.get("traceback", False))
 

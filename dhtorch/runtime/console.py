@@ -12,6 +12,7 @@ import io
 import logging
 import os
 import sys
+import time
 import unicodedata
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +23,9 @@ from typing import Any, TextIO
 #: Flag → level.
 VERBOSITY_FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"}
 _VERBOSITY_VARIABLE = "DHTORCH_VERBOSITY"
+
+#: Time between two lines of progress where stderr is no terminal, s. Source: chosen so that short jobs print none.
+_LINE_INTERVAL_S = 20.0
 
 #: Names of a folder that are compared with a missing one. Source: origin not recorded; bounds the time of a message.
 _MAX_NAMES_COMPARED = 2000
@@ -126,20 +130,36 @@ def escape_output() -> Iterator[None]:
 
 
 def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
-    """Iterate over ``items`` with a progress bar (rate, time left) on a terminal, without one elsewhere."""
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
+    """Iterate over ``items``; number done, rate and time left as a bar on a terminal, elsewhere as a line now and then.
 
-    columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn())
-    is_hidden = not sys.stderr.isatty() or get_verbosity() == "quiet"
-    with Progress(
-        *columns, console=Console(file=unwrap_terminal(sys.stderr)), disable=is_hidden, transient=True
-    ) as bar:
+    Quiet output has neither.
+    """
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress  # noqa: PLC0415
+
+    columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}")
+    is_quiet, is_terminal = get_verbosity() == "quiet", sys.stderr.isatty()
+    start = last_line = time.monotonic()
+    bar_console = Console(file=unwrap_terminal(sys.stderr))
+    with Progress(*columns, console=bar_console, disable=is_quiet or not is_terminal, transient=True) as bar:
         task = bar.add_task(escape_markup(text), total=total, rate="")
-        for item in items:
+        for done, item in enumerate(items, 1):
             yield item
-            speed = bar.tasks[task].speed
-            bar.update(task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
+            now = time.monotonic()
+            rate = _format_rate(done, total, now - start)
+            bar.update(task, advance=1, rate=rate)
+            if not (is_quiet or is_terminal) and done < total and now - last_line >= _LINE_INTERVAL_S:
+                print(f"{text}: {done} of {total}, {rate}", file=sys.stderr, flush=True)
+                last_line = now
+
+
+def _format_rate(done: int, total: int, seconds: float) -> str:
+    """Rate and time left: ``1.4/s, 0:35 left``, ``5.2 s each, 2:40 left``."""
+    each = max(seconds, 1e-6) / done
+    left = round(each * max(0, total - done))
+    rate = f"{1 / each:.1f}/s" if each < 1 else f"{each:.1f} s each"
+    hours, minutes = divmod(left // 60, 60)
+    return f"{rate}, {f'{hours}:{minutes:02d}' if hours else minutes}:{left % 60:02d} left"
 
 
 def get_verbosity() -> str:

@@ -2,18 +2,21 @@
 
 import base64
 import json
+import shlex
 import shutil
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
 
 from dhtorch import testing as writers
 from dhtorch.cli.completed_folder import count_estimated
-from dhtorch.cli.process_capture import coarse_to_fine
+from dhtorch.cli.process_capture import order_evenly
 from dhtorch.cli.run import main
 from dhtorch.metrics.holdout import range_split
 from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.viz.plots import colours, format_capture_name
 
 SMALL = ["method=map", "method.n=256", "planes=32", "steps=[1]", "mesh=false", "threads=1"]
 
@@ -36,14 +39,40 @@ def made(capture, tmp_path_factory):
 
 
 def test_one_word_makes_maps_a_map_a_page_and_a_picture(made):
-    assert {"depth", "sigma", "source", "meta", "overview.png", "map.ply", "map.glb", "view.html"} <= {
-        p.name for p in made.iterdir()
-    }
+    assert {
+        "depth",
+        "sigma",
+        "source",
+        "meta",
+        "previews",
+        "overview.png",
+        "preview.mp4",
+        "map.ply",
+        "map.glb",
+        "view.html",
+    } <= {p.name for p in made.iterdir()}
     rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
     assert len(rows) == 3 and all(row["pixels"]["swept"] > 1000 for row in rows)
     assert b"comment up " in (made / "map.ply").read_bytes()[:2000]
     width, height = Image.open(made / "overview.png").size
-    assert width > 600 and height > 400
+    assert width >= 1600 and height > 600, "a row for each of three frames"
+
+
+def test_every_frame_has_a_preview_and_all_frames_are_in_the_video(made):
+    names = sorted(p.stem for p in (made / "meta").iterdir())
+    previews = sorted((made / "previews").iterdir())
+    assert [p.name for p in previews] == [f"{name}.jpg" for name in names]
+    for path in previews:
+        pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+        assert pixels.shape[1] > 900
+        assert (pixels.max(-1) - pixels.min(-1) > 100).mean() > 0.1, "coloured depth"
+    with av.open(str(made / "preview.mp4")) as container:
+        shown = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert len(shown) == 3 and shown[0].shape[1] > 3 * 160
+    thirds = np.array_split(shown[1][80:180], 3, axis=1)
+    blank = np.array(colours.parse_rgb(colours.PICTURE))
+    sensor, completed = ((np.abs(third - blank).max(-1) < 12).mean() for third in thirds[1:])
+    assert completed < sensor - 0.05, "blank where the sensor has no depth, less where it is completed"
 
 
 def test_the_page_begins_with_the_numbers_and_the_picture(made):
@@ -56,7 +85,7 @@ def test_the_page_begins_with_the_numbers_and_the_picture(made):
     assert page.index("</main>") < page.index('<section id="poster"'), "the map comes first"
     assert base64.b64encode((made / "overview.png").read_bytes()).decode() in poster
     assert "Recovered " in opening and "Most frequent reasons for no answer: " in opening and "no_track" not in opening
-    assert "kitchen, frame" in poster and ", with frame" in poster, "whose picture, and of which views"
+    assert "Kitchen, frames 0, 1, 2: picture, sensor depth" in poster and "<h1>Kitchen · dhtorch</h1>" in page
 
 
 @pytest.mark.slow
@@ -76,11 +105,25 @@ def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made
 def test_the_beginning_is_made_where_time_is_short_and_said_again_it_goes_on(capture, tmp_path, capsys):
     words = [str(capture), f"out={tmp_path / 'x'}", *SMALL]
     assert main([*words, "minutes=1e-6"]) == 0
-    assert "for the 2 frames left" in capsys.readouterr().out
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Next: "))
+    assert "; 2 of 3 frames left at the time limit, to complete them: dhtorch " in line
     assert [p.stem for p in (tmp_path / "x/meta").iterdir()] == ["000001"], "the middle comes first"
     assert main([*words, "minutes=1e-6"]) == 0
-    assert main([*words, "minutes=null"]) == 0
-    assert len(list((tmp_path / "x/meta").iterdir())) == 3
+    assert main(shlex.split(line.rpartition(": dhtorch ")[2])) == 0, "as printed"
+    assert len(list((tmp_path / "x/meta").iterdir())) == len(list((tmp_path / "x/previews").iterdir())) == 3
+
+
+@pytest.mark.slow
+def test_frames_in_another_order_are_the_same_bits(capture, made, tmp_path):
+    """Interrupted after each frame and resumed, or in one go: the same files."""
+    words = [str(capture), f"out={tmp_path / 'x'}", *SMALL]
+    for _ in range(3):
+        assert main([*words, "minutes=1e-6"]) == 0
+    for name in ("depth", "sigma", "source", "previews"):
+        for path in (made / name).iterdir():
+            assert (tmp_path / "x" / name / path.name).read_bytes() == path.read_bytes(), path.name
+    for name in ("overview.png", "preview.mp4"):
+        assert (tmp_path / "x" / name).read_bytes() == (made / name).read_bytes(), name
 
 
 def test_a_frame_that_cannot_be_read_is_left_out_and_named(capture, tmp_path, capsys):
@@ -127,9 +170,17 @@ def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
     assert "depth without images" in refusal([alone], capsys)
 
 
-@pytest.mark.parametrize("n", [1, 2, 7, 40])
-def test_coarse_to_fine_takes_every_frame_once_and_begins_evenly(n):
-    order = coarse_to_fine(n)
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 40, 777])
+def test_frames_are_spread_over_the_capture_after_every_one(n):
+    order = order_evenly(n)
     assert sorted(order) == list(range(n)) and order[0] == n // 2
-    if n == 40:
-        assert max(np.diff(sorted({-1, 40, *order[:7]}))) <= 6
+    assert {0, n - 1} <= set(order[:3])
+    for k in range(4, n):
+        done = np.array(sorted(order[:k]))
+        assert np.diff(done).max() <= max(2.5 * n / k, 2), (k, "no part is left out")
+        assert abs((done < n / 2).sum() - k / 2) <= 4, (k, "no half waits for the other")
+
+
+def test_names_of_captures_are_titles():
+    names = {"kitchen_scan": "Kitchen scan", "living-room": "Living room", "2024-01-31": "2024-01-31", "küche": "Küche"}
+    assert {name: format_capture_name(name) for name in names} == names

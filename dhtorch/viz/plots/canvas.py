@@ -7,6 +7,7 @@ changes.
 from __future__ import annotations
 
 import pathlib
+import re
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -190,14 +191,15 @@ def truncate_text(text: str, width: float, size: float, end: int = 0) -> str:
     return f"{text[: max_letters - 1 - last]}…{text[len(text) - last :]}"
 
 
-def format_frame(scene: str, frame: object, views: Sequence[object] = ()) -> str:
-    """Title text of a frame of a scene and its source views."""
-    source_views = f", with {_format_frames(views)}" if views else ""
-    return f"{scene}, frame {frame}{source_views}"
+def format_capture_name(name: str) -> str:
+    """Name of a capture -> words for a title: ``kitchen_scan`` → ``Kitchen scan``."""
+    plain = re.sub(r"_+|(?<=[^\W\d])-+(?=[^\W\d])", " ", name).strip() or name
+    return plain[:1].upper() + plain[1:]
 
 
-def _format_frames(views: Sequence[object]) -> str:
-    return f"frame{'s' * (len(views) > 1)} {', '.join(map(str, views))}"
+def format_frame(capture: str, frame: object) -> str:
+    """Title text of a frame of a capture: ``Kitchen scan, frame 63``."""
+    return f"{format_capture_name(capture)}, frame {frame}"
 
 
 def append_cutoff(place: str, cutoff: float | None) -> str:
@@ -210,12 +212,12 @@ def prefix_title(words: str, title: str) -> str:
     return f"{title}: {words[0].lower()}{words[1:]}" if title else words
 
 
-def save_figure(figure: Any, path: Any) -> None:
-    """Write a figure, including artists outside its axes."""
+def save_figure(figure: Any, path: Any, kind: str = "png") -> None:
+    """Write a figure, including artists outside its axes; ``kind`` is the format where ``path`` is an open file."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # glyphs missing in the font
         if not isinstance(path, str | pathlib.Path):  # an open file
-            figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
+            figure.savefig(path, bbox_inches="tight", pad_inches=0.1, format=kind)
             return
         with storage.replace_at_end(path) as unfinished:
             figure.savefig(unfinished, bbox_inches="tight", pad_inches=0.1, format=pathlib.Path(path).suffix[1:])

@@ -28,6 +28,8 @@ TITLE_HEIGHT_PT = 20.0
 SCALE_HEIGHT_PT = 46.0
 #: Height of the title above all images, points.
 HEADER_HEIGHT_PT = 22.0
+#: Pixels per inch of a figure.
+_FIGURE_DPI = 160.0
 #: Quantile of depth at the lower end of the scale.
 _LOW_DEPTH_QUANTILE = 0.01
 #: Quantile of depth at the upper end of the scale.
@@ -46,8 +48,12 @@ def draw_completed(
     source: Any,  # (h, w) codes.Source
     *,
     title: str = "",
+    dpi: float = _FIGURE_DPI,
+    kind: str = "png",
 ) -> None:
     """Draw image, sensor depth, completed depth on the same scale, and its sigma / depth.
+
+    ``kind`` is the format where ``path`` is an open file.
 
     Log depth, near blue, far red; the nearest and farthest 1 % of the depths have the end colours. Pixels without an
     answer are blank.
@@ -64,7 +70,9 @@ def draw_completed(
         f"Completed: {_format_percent(answered)}, the rest no answer",
         apply_log_cmap(z, answered, depth_axis, colours.DEPTH_CMAP),
     )
-    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), sensor_panel, completed_panel), (z, s, answered))
+    panels = (("Picture", to_unit_rgb(image)), sensor_panel, completed_panel)
+    figure = _draw_four_panels(title, panels, (z, s, answered), dpi)
+    save_figure(figure, path, kind)
 
 
 def draw_aligned(
@@ -88,25 +96,23 @@ def draw_aligned(
         f"Aligned: {_format_percent(answered)}, the rest no answer",
         apply_log_cmap(z, answered, fit_depth_axis(z[answered]), colours.DEPTH_CMAP),
     )
-    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), input_panel, aligned_panel), (z, s, answered))
+    panels = (("Picture", to_unit_rgb(image)), input_panel, aligned_panel)
+    save_figure(_draw_four_panels(title, panels, (z, s, answered), _FIGURE_DPI), path)
 
 
 def _draw_four_panels(
-    path: str | Path | IO[bytes],
     title: str,
     panels: Sequence[tuple[str, np.ndarray]],
     result: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> None:
-    """Draw three images, then sigma / depth of ``result`` (depth, sigma, mask), with both scales and the title."""
+    dpi: float,
+) -> Any:
+    """Figure of three images, then sigma / depth of ``result`` (depth, sigma, mask), with both scales and the title."""
     z, s, answered = result
-    depth_axis, sigma_axis = (
-        fit_depth_axis(z[answered]),
-        Axis(*_SIGMA_REL_RANGE, "sigma / depth, %", log=True, percent=True),
-    )
+    depth_axis, sigma_axis = fit_depth_axis(z[answered]), fit_sigma_axis()
     ratio = np.where(answered, s / np.where(answered, z, 1), 1)
     height = PICTURE_WIDTH_PT * z.shape[0] / z.shape[1]
     top = 2 * (height + TITLE_HEIGHT_PT) + SCALE_HEIGHT_PT
-    canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi=160)
+    canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi)
     canvas.title(title, 2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT)
     for k, (words, pixels) in enumerate(
         (*panels, ("Sigma / depth", apply_log_cmap(ratio, answered, sigma_axis, colours.ERROR_CMAP)))
@@ -119,7 +125,7 @@ def _draw_four_panels(
         canvas.picture(pixels, (left, bottom, PICTURE_WIDTH_PT, height))
     draw_scale(canvas, depth_axis, colours.DEPTH_CMAP, 0.0)
     draw_scale(canvas, sigma_axis, colours.ERROR_CMAP, PICTURE_WIDTH_PT + PICTURE_GAP_PT)
-    save_figure(canvas.figure, path)
+    return canvas.figure
 
 
 def fit_depth_axis(depth: np.ndarray) -> Axis:
@@ -127,6 +133,11 @@ def fit_depth_axis(depth: np.ndarray) -> Axis:
     low, high = np.quantile(depth, (_LOW_DEPTH_QUANTILE, _HIGH_DEPTH_QUANTILE)).tolist() if depth.size else (0.5, 5.0)
     high = max(high, 1.25 * low)
     return Axis(low, high, "depth, m", log=True)
+
+
+def fit_sigma_axis() -> Axis:
+    """The log axis of sigma / depth, the same in every figure."""
+    return Axis(*_SIGMA_REL_RANGE, "sigma / depth, %", log=True, percent=True)
 
 
 def apply_log_cmap(values: np.ndarray, there: np.ndarray, axis: Axis, kind: str) -> np.ndarray:
@@ -144,23 +155,23 @@ def apply_cmap(places: np.ndarray, kind: str) -> np.ndarray:
     return colormaps[kind](places)[..., :3]
 
 
-def draw_scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
+def draw_scale(canvas: Canvas, axis: Axis, kind: str, left: float, width: float = PICTURE_WIDTH_PT) -> None:
     """Draw a colour scale with ticks and label below an image."""
     base, height = SCALE_HEIGHT_PT - 18.0, 9.0
-    canvas.picture(apply_cmap(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, PICTURE_WIDTH_PT, height))
+    canvas.picture(apply_cmap(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, width, height))
     decades = axis.log and axis.high > _MIN_DECADE_RATIO * axis.low
     ticks = axis.ticks(8) if decades else Axis(axis.low, axis.high).ticks(8)
     for tick in ticks:
-        u = left + PICTURE_WIDTH_PT * axis.place(tick)
+        u = left + width * axis.place(tick)
         canvas.lines([((u, base), (u, base - 3))], Stroke(INK, 0.7))
         canvas.text(
             axis.write(tick),
-            min(max(u, left + 6), left + PICTURE_WIDTH_PT - 6),
+            min(max(u, left + 6), left + width - 6),
             base - 13,
             size=TEXT_SIZE_PT - 1,
             ha="center",
         )
-    canvas.text(axis.label, left + PICTURE_WIDTH_PT / 2, 1, ha="center")
+    canvas.text(axis.label, left + width / 2, 1, ha="center")
 
 
 def _format_percent(mask: np.ndarray) -> str:
