@@ -37,6 +37,8 @@ _SHEET_DPI = 116.0
 _MAX_STRIP_WIDTH_PX = 640
 #: Pixels per inch of the strip: two pixels per point, so that its sides are even, which video encoders require.
 _STRIP_DPI = 144.0
+#: Empty rows below the key of the strip, even.
+_STRIP_MARGIN_PX = 12
 #: Side of the square beside the key of pixels without depth, points.
 _KEY_SIDE_PT = 11.0
 
@@ -125,7 +127,8 @@ class Strip:
         draw_scale(canvas, axis, colours.DEPTH_CMAP, self._lefts[1], full - self._lefts[1])
         agg = FigureCanvasAgg(canvas.figure)
         agg.draw()
-        self._background = np.asarray(agg.buffer_rgba())[..., :3].copy()
+        margin = (0, _STRIP_MARGIN_PX), (0, 0), (0, 0)
+        self._background = np.pad(np.asarray(agg.buffer_rgba())[..., :3], margin, constant_values=255)
         self.picture_hw = self._background.shape[0], self._background.shape[1]  # even, px
         self._top = round((HEADER_HEIGHT_PT + TITLE_HEIGHT_PT) * _STRIP_DPI / 72)
 
