@@ -37,6 +37,7 @@ from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation.capture_check import check_capture
+from dhtorch.viz.plots.canvas import format_capture_name
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
 
 _MAX_LEVELS = 2  # levels of folders searched below the path
@@ -46,6 +47,8 @@ _NO_INTRINSICS_MESSAGE = (
 )
 _ASSUMED_FOV_DEG = 60.0  # horizontal field of view assumed for a capture without intrinsics, degrees
 _TILE_GAP = 0.02  # margin around a tile of the contact sheet, in widths of its cell
+_ROW_LABELS = {"image": "Picture", "depth": "Depth", "conf": "Confidence\n0 dark, 2 bright"}
+_BESIDE_TILES = {"textcoords": "offset points", "fontsize": 7, "color": INK, "ha": "right", "va": "center"}
 _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are drawn larger
 _CAPTURE_SUFFIXES = (  # of files that may be a whole capture
     (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
@@ -376,7 +379,8 @@ def write_contact_sheet(survey: Survey, out: Path) -> Path:
     width = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8)
     heights = [tiles_height, 1.9] if plots else [tiles_height]
     figure = Figure(figsize=(width, sum(heights) + 0.3), dpi=120, layout="constrained")
-    figure.suptitle(f"{survey.name}: {survey.format}", fontsize=9)
+    title = f"{format_capture_name(survey.name)}: {survey.format}"
+    figure.suptitle(title, fontsize=9, fontweight="bold", color=INK, x=0.01, ha="left")
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     _draw_tiles(parts[0], rows, survey)
     for k, draw in enumerate(plots):
@@ -397,6 +401,7 @@ def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
     for r, kind in enumerate(rows):
         axes = figure.add_subplot(len(rows), 1, r + 1)
         axes.axis("off")
+        axes.annotate(_ROW_LABELS[kind], (0, height / 2), (-4, 0), rotation=90, **_BESIDE_TILES)
         for k, tile in enumerate(survey.tiles):
             picture = getattr(tile, kind)
             if picture is None:
@@ -405,7 +410,8 @@ def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
             _draw_tile(axes, picture, kind, limits, extent)
             if not any(getattr(tile, above) is not None for above in rows[:r]):
                 place = (extent[0] + extent[1]) / 2, extent[3]
-                axes.annotate(tile.title[:22], place, (0, 2), textcoords="offset points", fontsize=6, ha="center")
+                words = f"frame {tile.title}" if tile.title.isdigit() else tile.title
+                axes.annotate(words[:22], place, (0, 2), textcoords="offset points", fontsize=6, ha="center")
         axes.set(xlim=(-_TILE_GAP, len(survey.tiles) + _TILE_GAP), ylim=(0, height), aspect="equal")
 
 
@@ -464,7 +470,7 @@ def _plot_depths(axes: Any, survey: Survey) -> None:
     counts, edges = np.histogram(survey.depths.numpy(), bins=90, range=(0, 1.1 * high))
     middle = (edges[1:] + edges[:-1]) / 2
     axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[DEPTH_CMAP]((middle - low) / (high - low)))
-    axes.set_xlabel("depth [m]", fontsize=7)
+    axes.set_xlabel("depth, m, in the colours of the maps above (white: no return)", fontsize=7)
     axes.set_yticks([])
     axes.tick_params(labelsize=6)
 
@@ -481,7 +487,7 @@ def _plot_path(axes: Any, survey: Survey) -> None:
     ):
         axes.plot(place[a], place[b], mark, color=colour, markersize=4, label=label)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"path: {'xyz'[a]} [m]", fontsize=7)
-    axes.set_ylabel(f"{'xyz'[b]} [m]", fontsize=7)
+    axes.set_xlabel(f"path of the camera: {'xyz'[a]}, m", fontsize=7)
+    axes.set_ylabel(f"{'xyz'[b]}, m", fontsize=7)
     axes.tick_params(labelsize=6)
     axes.legend(fontsize=6, frameon=False)

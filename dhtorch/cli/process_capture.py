@@ -345,24 +345,23 @@ def _recover_task(
 
 
 def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> RecoveredFrames:
-    """Complete the frames in order until the time limit; unreadable frames are skipped, also as source views."""
+    """Complete the frames in order until the time limit, at least one; unreadable ones are skipped, also as views."""
     recovered = RecoveredFrames(task, [], {}, 0)
     todo = [i for i in task.frames if task.missing(i)]
     recovered.frames = [i for i in task.frames if not task.missing(i)]
-    is_first = not recovered.frames
+    n_before = len(recovered.frames)
 
     def in_time() -> Iterator[int]:
         for n, i in enumerate(todo):
-            if until is not None and time.monotonic() > until and recovered.frames:
+            if until is not None and time.monotonic() > until and len(recovered.frames) > n_before:
                 recovered.left = len(todo) - n
                 return
             yield i
 
     with complete.close_on_exit(task):
         for i in progress(in_time(), f"{task.scene.name}: frames{_format_limit(until)}", len(todo)):
-            if _try_frame(recovered, i) and is_first:
+            if _try_frame(recovered, i) and len(recovered.frames) == 1:
                 recover_pictures.write_contact_sheet(task, recovered.frames)
-                is_first = False
     return recovered
 
 
