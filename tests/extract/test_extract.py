@@ -119,6 +119,7 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     assert code == 0 and err == "", err
     assert "features: 3 shards, 12 rows" in out and "6 no second view" in out
     features, expected = FeatureTable("features"), live(robot)
+    assert repr(features).startswith("FeatureTable(") and "tokens" in repr(features)
     joined = JoinedDataset(Items(robot), features)
     assert len(features) == len(joined) == sum(LENGTHS)
     with torch.no_grad():
