@@ -7,6 +7,7 @@ depend neither on the tests before it nor on the process that it runs in.
 Every test and what it starts hears Ctrl-C, too: a shell has it ignored by what runs in its background.
 """
 
+import math
 import random
 import signal
 
@@ -14,7 +15,10 @@ import numpy as np
 import pytest
 import torch
 
+from dhtorch.runtime import console
+
 torch.set_num_threads(1)
+console._LINE_INTERVAL_S = math.inf  # no line of progress among the errors that a test compares, on a slow machine
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

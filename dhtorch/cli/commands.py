@@ -64,9 +64,9 @@ COMMANDS: dict[str, Command] = {
         "depth beyond the sensor's range: completed maps, a 3D map, a page",
         "PATH",
         "Recovers depth beyond the sensor's range from a capture of your own and says how to go on. Frames "
-        "are processed coarse to fine until the time limit. Writes depth/, sigma/, source/ and meta/ of every "
-        "frame, overview.png (picture, sensor, completed), map.ply, map.glb and view.html (3D, in any "
-        "browser).",
+        "are processed in an order that covers the capture at any time, until the time limit. Writes depth/, "
+        "sigma/, source/, meta/ and previews/ of every frame, overview.png (picture, sensor, completed), "
+        "preview.mp4, map.ply, map.glb and view.html (3D, in any browser).",
         (
             ("PATH", "recover depth, print a summary and the next step"),
             ("PATH --minutes null", "every frame, without a time limit"),

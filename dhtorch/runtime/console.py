@@ -25,7 +25,7 @@ VERBOSITY_FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbos
 _VERBOSITY_VARIABLE = "DHTORCH_VERBOSITY"
 
 #: Time between two lines of progress where stderr is no terminal, s. Source: chosen so that short jobs print none.
-_LINE_INTERVAL_S = 20.0
+_LINE_INTERVAL_S = 30.0
 
 #: Names of a folder that are compared with a missing one. Source: origin not recorded; bounds the time of a message.
 _MAX_NAMES_COMPARED = 2000

@@ -9,7 +9,9 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from support.tiny_runs import ROOM, TINY
 
@@ -138,6 +140,24 @@ def test_progress_is_for_terminals(monkeypatch, stream, level, drawn):
     assert list(console.progress(range(3), "pairs of a room", 3)) == [0, 1, 2]
     assert ("pairs of a room" in shown.getvalue()) == drawn
     assert drawn or shown.getvalue() == ""
+
+
+def test_progress_is_a_line_now_and_then_elsewhere(monkeypatch):
+    """Number done, rate and time left, not after the last item; none with quiet output."""
+    now = iter(np.arange(0, 100, 5.0).tolist())
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr(console, "_LINE_INTERVAL_S", 10.0)
+    for level, lines in (
+        ("normal", ["a room: frames: 2 of 5, 5.0 s each, 0:15 left", "a room: frames: 4 of 5, 5.0 s each, 0:05 left"]),
+        ("quiet", []),
+    ):
+        monkeypatch.setenv(console._VERBOSITY_VARIABLE, level)
+        monkeypatch.setattr(sys, "stderr", io.StringIO())
+        assert list(console.progress(range(5), "a room: frames", 5)) == list(range(5))
+        assert sys.stderr.getvalue().splitlines() == lines
+    assert console._format_rate(600, 3600, 300) == "2.0/s, 25:00 left" and "2:00:00 left" in console._format_rate(
+        1, 2, 7200
+    )
 
 
 @pytest.mark.slow
