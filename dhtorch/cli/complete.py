@@ -329,7 +329,8 @@ def _render_completed(
 ) -> bytes:
     """The figure of a complete frame; ``maps`` and ``source`` from ``read_completed_maps``, options of the drawing."""
     out = io.BytesIO()
-    draw_completed(out, image, **maps, source=source, title=completed.format_frame_title(task, i), **options)
+    options["title"] = completed.format_frame_title(task, i)
+    draw_completed(out, image, maps["depth"], maps["sigma"], source, **options)
     return out.getvalue()
 
 

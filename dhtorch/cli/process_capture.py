@@ -335,10 +335,10 @@ def _recover_task(
     opening = recover_page.build_opening(
         [*recover_page.describe_check(check), *lines],
         stats,
-        *recover_pictures.write_contact_sheet(task, recovered.frames),
+        *recover_pictures.write_overview(task, recovered.frames),
     )
     written = _write_map(recovered, placed, opening, settings, progress)
-    recover_pictures.write_preview_video(task, recovered.frames, progress)
+    recover_pictures.write_moving_preview(task, recovered.frames, progress)
     shown = written[-1] if written else CONTACT_SHEET
     written = ["depth/", "previews/", CONTACT_SHEET, PREVIEW_VIDEO, *written]
     return [*lines, _format_next_step(recovered, shown), f"Wrote {', '.join(written)} in {folder}."]
@@ -361,7 +361,7 @@ def _complete_in_time(task: CompletionTask, until: float | None, progress: Progr
     with complete.close_on_exit(task):
         for i in progress(in_time(), f"{task.scene.name}: frames{_format_limit(until)}", len(todo)):
             if _try_frame(recovered, i) and len(recovered.frames) == 1:
-                recover_pictures.write_contact_sheet(task, recovered.frames)
+                recover_pictures.write_overview(task, recovered.frames)
     return recovered
 
 

@@ -38,7 +38,7 @@ _SCALE_FRAMES = 12
 _MIN_FPS, _MAX_FPS, _VIDEO_SECONDS = 2, 10, 8
 
 
-def write_contact_sheet(task: CompletionTask, frames: Sequence[int]) -> tuple[bytes, str]:
+def write_overview(task: CompletionTask, frames: Sequence[int]) -> tuple[bytes, str]:
     """Write the contact sheet of evenly spread complete frames -> its PNG and a caption."""
     shown = _pick_evenly(sorted(frames), _SHEET_FRAMES)
     views = [_read_view(task, i) for i in shown]
@@ -52,7 +52,7 @@ def write_contact_sheet(task: CompletionTask, frames: Sequence[int]) -> tuple[by
     return out.getvalue(), f"{place}: {panels}."
 
 
-def write_preview_video(task: CompletionTask, frames: Sequence[int], progress: Progress) -> None:
+def write_moving_preview(task: CompletionTask, frames: Sequence[int], progress: Progress) -> None:
     """Write the moving preview of complete frames, in their order in the capture: picture, sensor, completed."""
     shown = _pick_evenly(sorted(frames), _MAX_VIDEO_FRAMES)
     scale_views = [_read_view(task, i) for i in _pick_evenly(shown, _SCALE_FRAMES)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def write_preview_video(path: Path, hw: tuple[int, int], pictures: Iterable[np.n
     encoder = next((name for name in _PREVIEW_ENCODERS[:-1] if name in av.codecs_available), _PREVIEW_ENCODERS[-1])
     options = dict(_PREVIEW_OPTIONS) if encoder == _PREVIEW_ENCODERS[0] else {}
     with storage.write_atomically(path) as sink, av.open(sink, "w", format="mp4") as container:
-        stream = container.add_stream(encoder, rate=fps, options=options)
+        stream: Any = container.add_stream(encoder, rate=fps, options=options)
         stream.height, stream.width = hw
         stream.pix_fmt = "yuv420p"
         stream.codec_context.thread_count = 1  # the bytes of the file do not depend on the machine
