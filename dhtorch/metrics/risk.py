@@ -7,6 +7,8 @@ curve is then the expectation over all orders of the tied answers and does not d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -18,6 +20,9 @@ _MIN_POINTS = 10
 
 #: Number of equal steps of coverage between which the curve is tested for monotonicity.
 _N_MONOTONICITY_STEPS = 10
+
+#: Least depth of a knee below the chord, in ranges of the risk. Source: chosen, so that rounding makes no knee.
+_MIN_KNEE_DEPTH = 0.01
 
 
 def risk_curve(
@@ -137,6 +142,29 @@ def keep_surest(pooled: Points, n: int) -> Points:
         residual_px=torch.where(keep, pooled.residual_px, torch.nan),
         score=torch.where(keep, pooled.score, 0.0),
     )
+
+
+def find_knee(coverage: Sequence[float], risk: Sequence[float]) -> int | None:
+    """Index of the knee of a risk–coverage curve: the point farthest below the chord between its two ends.
+
+    Both axes are scaled to the ends of the coverage and to the range of the risk, so that the knee does not depend on
+    units. Below the knee the risk hardly falls as less is answered. None: fewer than three points, or no point is below
+    the chord by more than a hundredth of the range of the risk, as of a straight line.
+
+    Source: V. Satopaa et al., "Finding a 'kneedle' in a haystack", 2011 (largest distance to the chord of the
+    normalised curve).
+    """
+    ends = sorted(range(len(coverage)), key=lambda k: coverage[k])
+    if len(ends) < 3:
+        return None
+    first, last = ends[0], ends[-1]
+    width, height = coverage[last] - coverage[first], max(risk) - min(risk)
+    if not (width > 0 and height > 0):
+        return None
+    slope = (risk[last] - risk[first]) / width
+    below = [risk[first] + slope * (c - coverage[first]) - r for c, r in zip(coverage, risk, strict=True)]
+    deepest = max(range(len(below)), key=below.__getitem__)
+    return deepest if below[deepest] > _MIN_KNEE_DEPTH * height else None
 
 
 def cap_error(error: Tensor) -> Tensor:

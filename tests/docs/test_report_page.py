@@ -16,6 +16,7 @@ from dhtorch.experiments.report import cells, curves, layouts, page, plots, publ
 from dhtorch.experiments.report.figure import Figure
 from dhtorch.experiments.report.reading import flatten_row, scene_rows
 from dhtorch.experiments.report.tables import MAIN_COLUMNS, ReportTable, full_tables
+from dhtorch.metrics import risk
 from dhtorch.runtime import results as result_files
 from dhtorch.viz import plots as drawing
 from dhtorch.viz.plots import Axis, Panel, Stroke, colours
@@ -205,6 +206,7 @@ SOURCES = {
     "hole_census": (published.HOLE_CENSUS,),
     "device_pose": (published.DEVICE_POSE,),
     "motion": (published.BASELINE_MOTION,),
+    "global_map": (published.GLOBAL_MAP,),
     "latency": (published.LATENCY,),
     "learned": (published.LEARNED,),
     "helix_correlation": (published.HELIX,),
@@ -355,7 +357,7 @@ def test_the_cohort_that_the_summary_leaves_unnamed_decides():
     result["summary"]["paper.heldout.ece"]["value"], result["summary"]["paper.ece"]["value"] = 0.111, 0.222
     held, split, steps = layouts.layout_tables(result)[:3]
     assert held.rows[0][3] == "0.111" and split.rows[0][3] == "0.222"
-    assert [row[0] for row in steps.rows] == ["0", "0.1", "0.3", "0.5"]
+    assert [row[0].removesuffix(" (knee)") for row in steps.rows] == ["0", "0.1", "0.3", "0.5"]
     assert [steps.rows[2][k] for k in (2, 4)] == ["34.3 %", "9.5 %"]
 
 
@@ -477,3 +479,50 @@ def test_figures_of_one_panel_stand_side_by_side():
         (None, 0),
         ("figures", 1),
     ]
+
+
+@pytest.mark.parametrize("result", [r for r in RESULTS if r["experiment"] in SOURCES], ids=list(SOURCES))
+@pytest.mark.parametrize("one_scene", [False, True])
+def test_the_console_prints_the_papers_figures_also_for_one_scene(result, one_scene, capsys):
+    if one_scene:
+        result = {**result, "rows": [row for row in result["rows"] if row["scene"] == archived.SCENES[0]]}
+    report.print_brief(result)
+    printed = capsys.readouterr().out
+    for quoted in SOURCES[result["experiment"]]:
+        for name, line in quoted.lines.items():
+            assert all(cell in printed for cell in line.values()), f"{quoted.where}: {name}"
+        assert " ".join(quoted.notes) in " ".join(printed.split())
+
+
+# ---------------------------------------------------------------------------------------------------- the knee
+
+
+def test_the_knee_is_the_point_farthest_below_the_chord():
+    coverage, risks = [0.6, 0.5, 0.35, 0.2, 0.1], [0.13, 0.11, 0.08, 0.075, 0.07]
+    assert risk.find_knee(coverage, risks) == 2
+    assert risk.find_knee([10 * c for c in coverage], [r / 7 + 3 for r in risks]) == 2, "no units"
+    assert risk.find_knee(coverage[::-1], risks[::-1]) == 2, "no order of the points"
+    for straight in ([0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.1, 0.25, 0.3], [0.1, 0.1, 0.1]):
+        assert risk.find_knee([0.1, 0.2, 0.3], straight) is None, straight
+    assert risk.find_knee([0.1, 0.2], [0.1, 0.2]) is None and risk.find_knee([], []) is None
+    assert risk.find_knee([0.2, 0.2, 0.2], [0.1, 0.2, 0.3]) is None, "no width"
+
+
+def test_the_knee_stands_in_the_table_and_in_the_figures():
+    result = archived.calibration()
+    numbers = {0.1: (0.55, 0.10), 0.3: (0.40, 0.05), 0.5: (0.10, 0.045)}
+    for threshold, (coverage, error) in numbers.items():
+        result["summary"][f"paper.at_{threshold}.coverage"]["value"] = coverage
+        result["summary"][f"paper.at_{threshold}.median_rel"]["value"] = error
+    result["summary"]["paper.coverage"]["value"], result["summary"]["paper.median_rel"]["value"] = 0.65, 0.13
+    assert layouts.threshold_knee(result, "paper") == "0.3"
+    (table,) = [t for t in layouts.layout_tables(result) if t.title.startswith("Selective threshold, paper")]
+    assert [row[0] for row in table.rows] == ["0", "0.1", "0.3 (knee)", "0.5"] and "at 0.3" in table.note
+    figures = {figure.title: figure for figure in plots.result_figures(result)}
+    for title in ("Threshold on the score", "Risk against coverage"):
+        tips = [mark.tooltip for panel in figures[title].panels for mark in panel.marks if "knee" in mark.tooltip]
+        assert tips and layouts.KNEE_DEFINITION in figures[title].caption, title
+    (tip,) = [m.tooltip for p in figures["Threshold on the score"].panels for m in p.marks if "paper, knee" in m.tooltip]
+    assert "score from 0.3" in tip
+    result["summary"]["paper.at_0.3.median_rel"]["n"] -= 1
+    assert layouts.threshold_knee(result, "paper") == "0.1", "a threshold at which a scene is silent is no point"

@@ -209,6 +209,11 @@ def motion():
     return result("motion", rows_of(variants, notes={("office_desk", "gap x2"): "too short"}, more=more))
 
 
+def global_map():
+    metrics = ("n_voxels", "voxels_vs_sensor", "n_islands", "largest_island", "right_share", "n_fragments")
+    return screened("global_map", [f"{a} {b}" for b in ("device", "anchored") for a in ("sensor", "fused")], metrics)
+
+
 def latency():
     rows = []
     for hw, scale in (((224, 224), 1.0), ((1440, 1920), 4.0)):
@@ -310,6 +315,7 @@ ALL = (
     hole_census,
     device_pose,
     motion,
+    global_map,
     latency,
     learned,
     helix_correlation,

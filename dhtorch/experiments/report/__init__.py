@@ -60,15 +60,18 @@ def print_tables(result: Result, console: Any = None) -> None:
 
 
 def print_brief(result: Result) -> None:
-    """Print the main table of a result; with many scenes only the summary."""
-    for table in (layout_tables(result) or generic_tables(result, SHOWN_COLUMNS))[:1]:
-        n_body = len(table.rows) - table.footer - table.quoted
-        summary_only, single_row = n_body > _MAX_BRIEF_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
-        start, end = (
-            (n_body, None) if summary_only else (0, 1 if single_row else None)
-        )  # the summary of one scene repeats its row
-        footer, quoted = (0, 0) if single_row else (table.footer, table.quoted)
-        text.print_table(replace(table, rows=table.rows[start:end], footer=footer, quoted=quoted))
+    """Print the main table of a result and every other one with figures of the paper; of many scenes the summary."""
+    for k, table in enumerate(layout_tables(result) or generic_tables(result, SHOWN_COLUMNS)):
+        if k == 0 or table.cites_paper:
+            text.print_table(_shorten_table(table))
+
+
+def _shorten_table(table: ReportTable) -> ReportTable:
+    """The table without its summary if that repeats a single scene, or of many scenes with the summary alone."""
+    n_body = len(table.rows) - table.footer - table.quoted
+    if table.footer and n_body == 1:
+        return replace(table, rows=[*table.rows[:1], *table.rows[n_body + table.footer :]], footer=0)
+    return replace(table, rows=table.rows[n_body:]) if table.footer and n_body > _MAX_BRIEF_ROWS else table
 
 
 def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from dhtorch.experiments.report.cells import format_value
 from dhtorch.experiments.report.figure import (
+    KNEE_WIDTH_PT,
     MAX_DRAWN_ERROR,
     MIN_DRAWN_ERROR,
     Figure,
@@ -17,7 +18,9 @@ from dhtorch.experiments.report.figure import (
     variant_legend,
     variant_strokes,
 )
+from dhtorch.experiments.report.layouts import KNEE_DEFINITION
 from dhtorch.experiments.report.reading import Result, Row, variant_names
+from dhtorch.metrics.risk import find_knee
 from dhtorch.viz.plots import MIN_CURVE_ANSWERS, Axis, Panel, Stroke, fit_axis
 from dhtorch.viz.plots.colours import FAINT, SOFT
 
@@ -48,9 +51,15 @@ def risk_figure(result: Result) -> Figure | None:
         if with_oracle:
             panel.line(x, best, stroke._replace(width=1.0, dashes=(2.5, 2.5), opacity=0.8))
         panel.line(x, y, stroke)
+        points = [(c, r) for c, r in zip(x, y, strict=True) if c is not None and r is not None]
+        knee = find_knee([c for c, _ in points], [r for _, r in points])
+        if knee is not None:
+            c, r = points[knee]
+            label = f"knee: {format_value(r, 'mean_rel')} at {format_value(c, 'coverage')}"
+            panel.dot(c, r, stroke, label, width=KNEE_WIDTH_PT)
 
     caption = "Mean relative error (at most 1) of the most confident answers; logarithmic. A mean over fewer "
-    caption += f"than {MIN_CURVE_ANSWERS} answers is not drawn." + " Dashed: the best possible order." * with_oracle
+    caption += f"than {MIN_CURVE_ANSWERS} answers is not drawn. Large dot: the knee, {KNEE_DEFINITION}." + " Dashed: the best possible order." * with_oracle
     return _by_scene(result, "Risk against coverage", caption, "risk_coverage", x_axis, y_axis, draw)
 
 

@@ -14,6 +14,8 @@ from dhtorch.viz.plots.colours import PAPER_FILL, SOFT
 MIN_DRAWN_ERROR = 1e-3
 #: Largest relative error of a logarithmic axis.
 MAX_DRAWN_ERROR = 10.0
+#: Diameter of the dot that marks a knee, points.
+KNEE_WIDTH_PT = 11.0
 #: Legend entry of the paper's figures.
 PUBLISHED_KEY = LegendKey("published", PAPER_FILL, "diamond")
 #: Stroke of a single scene among others.

@@ -28,6 +28,7 @@ from dhtorch.experiments.report.tables import (
     scene_table,
     variant_table,
 )
+from dhtorch.metrics.risk import find_knee
 
 #: What the method of the paper is here, and why some of its cells are blank.
 _COMPARISON_NOTE = (
@@ -35,6 +36,9 @@ _COMPARISON_NOTE = (
     "here, see docs/methods.md; opencv: the same stages of OpenCV. Cells of a sigma or a probability are blank for "
     "methods that state none."
 )
+
+#: What tables and figures mark as the knee, see :func:`dhtorch.metrics.risk.find_knee`.
+KNEE_DEFINITION = "the point farthest below the chord between the ends of the curve"
 
 _CUTOFF_PATTERN = r"(?:gated,? )?cutoff .*"
 _RANGE_SPLIT_LINES: KnownLines = (
@@ -177,17 +181,20 @@ def _calibration(result: Result) -> list[ReportTable]:
 
 def _thresholds(result: Result, variant: str) -> ReportTable | None:
     """Table of coverage and errors of the answers above each threshold of the score; None with fewer than two."""
-    rows = []
+    rows, knee = [], threshold_knee(result, variant)
     for name, numbers in threshold_points(result, variant):
-        published_cells, cells = published.THRESHOLDS.lines.get(name, {}), [name]
+        published_cells = published.THRESHOLDS.lines.get(name, {})
+        cells = [f"{name} (knee)" if name == knee else name]
         for m in ("coverage", "median_rel"):
             cells += [format_value(numbers[m], m), published_cells.get(m, EMPTY_CELL)]
         rows.append([*cells, format_value(numbers["p90_rel"], "p90_rel")])
     over = (("", 1), (metric_heading("coverage"), 2), (metric_heading("median_rel"), 2), ("", 1))
     heads = ["score from", OURS_LABEL, PUBLISHED_LABEL, OURS_LABEL, PUBLISHED_LABEL, metric_heading("p90_rel")]
     title = f"Selective threshold, {variant}, medians over scenes"
+    found = f"at {knee}" if knee else "none"
+    note = f"Knee, {KNEE_DEFINITION}, while every scene has answers: {found}. {published_source(result, published.THRESHOLDS)}"
     return (
-        ReportTable(title, heads, rows, over=over, note=published_source(result, published.THRESHOLDS))
+        ReportTable(title, heads, rows, over=over, note=note)
         if len(rows) > 1
         else None
     )
@@ -225,6 +232,14 @@ def _motion(result: Result) -> list[ReportTable]:
     """Table of errors and recovered holes by baseline."""
     columns = ("n_scenes", "baseline_m", "truth_kept", "coverage", "median_rel", "n_recovered", "recovered_share")
     return [variant_table(result, "Motion dependence, medians over scenes", columns, None, published.BASELINE_MOTION)]
+
+
+def _global_map(result: Result) -> list[ReportTable]:
+    """Table of the maps with and without recovered points; the paper has a statement, no figure."""
+    columns: tuple[str, ...] = ("n_scenes", "n_voxels", "voxels_vs_sensor", "right_share")
+    columns += ("n_islands", "largest_island", "n_fragments")
+    title = "Maps, medians over scenes; voxels, islands and fragments added up"
+    return [variant_table(result, title, columns, None, published.GLOBAL_MAP)]
 
 
 def _learned(result: Result) -> list[ReportTable]:
@@ -280,6 +295,23 @@ def _learned_score(result: Result) -> list[ReportTable]:
     return [variant_table(result, "The same answers in the order of each score, over scenes", columns)]
 
 
+def threshold_knee(result: Result, variant: str) -> str | None:
+    """The threshold at the knee of median error against coverage; None without a knee.
+
+    Thresholds at which a scene has no answer left are no points of the curve: their median is over other scenes.
+    """
+    n_scenes = summary_entry(result, variant, "median_rel").get("n")
+    known = [
+        (name, numbers["coverage"], numbers["median_rel"])
+        for name, numbers in threshold_points(result, variant)
+        if summary_entry(result, variant, f"at_{name}.median_rel").get("n", n_scenes) == n_scenes
+        and numbers["coverage"] is not None
+        and numbers["median_rel"] is not None
+    ]
+    k = find_knee([c for _, c, _ in known], [e for _, _, e in known])
+    return None if k is None else known[k][0]
+
+
 EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "range_split": _range_split,
     "real_holes": _real_holes,
@@ -289,6 +321,7 @@ EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "hole_census": _census,
     "device_pose": _device_pose,
     "motion": _motion,
+    "global_map": _global_map,
     "learned": _learned,
     "ablation": _ablation,
     "latency": timings.latency_tables,

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dhtorch.experiments.report import published
 from dhtorch.experiments.report.cells import format_value
 from dhtorch.experiments.report.figure import (
+    KNEE_WIDTH_PT,
     PUBLISHED_KEY,
     SCENE_STROKE,
     Figure,
@@ -17,7 +18,7 @@ from dhtorch.experiments.report.figure import (
     variant_legend,
     variant_strokes,
 )
-from dhtorch.experiments.report.layouts import threshold_points
+from dhtorch.experiments.report.layouts import KNEE_DEFINITION, threshold_knee, threshold_points
 from dhtorch.experiments.report.reading import Result, Row, metric_value, summary_entry, variant_names
 from dhtorch.viz.plots import LegendKey, Panel, Stroke, fit_axis
 from dhtorch.viz.plots.colours import INK
@@ -64,10 +65,13 @@ def threshold_figure(result: Result) -> Figure | None:
         panel.line([c for _, c, _ in path], [e for _, _, e in path], strokes[v])
         for name, c, e in path:
             panel.dot(c, e, strokes[v], f"{v}, {_sweep_point(name, c, e)}")
+        for name, c, e in (point for point in path if point[0] == threshold_knee(result, v)):
+            panel.dot(c, e, strokes[v], f"{v}, knee, {_sweep_point(name, c, e)}", width=KNEE_WIDTH_PT)
     for name, (coverage, error) in cited.items():
         if coverage is not None and error is not None:
             panel.diamond(coverage, error, f"published, {_sweep_point(name, coverage, error)}")
-    caption = "Each dot is a threshold on the score, medians over scenes; the paper gives two (0 and 0.3)."
+    caption = "Each dot is a threshold on the score, medians over scenes; the paper gives two (0 and 0.3). "
+    caption += f"Large dot: the knee, {KNEE_DEFINITION}."
     legend = [*variant_legend(result, list(paths)), PUBLISHED_KEY]
     return Figure("Threshold on the score", caption, [panel], legend, wide=True)
 

@@ -91,6 +91,11 @@ class ReportTable:
     note: str = ""  # text below the table
     best: frozenset[tuple[int, int]] = frozenset()  # (row, column) of highlighted cells
 
+    @property
+    def cites_paper(self) -> bool:
+        """Whether figures of the paper stand in rows or columns."""
+        return self.quoted > 0 or PUBLISHED_LABEL in self.head
+
     def flat_head(self) -> list[str]:
         """One heading per column, prefixed by its upper heading."""
         above = [text for text, span in self.over for _ in range(span)] or [""] * len(self.head)
