@@ -84,6 +84,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     **dict.fromkeys(("sensor_sigma_m", "sensor_sigma_rel", "min_weight"), _at_least_zero()),
     "min_conf": _whole_number(0),
     "min_maps": _whole_number(1),
+    "weight": _one_of("variance", "confidence"),
     "mesh": _or_null(_TRUE_OR_FALSE),
     "dense": _DENSE_OPTIONS,
     "max_frames": _or_null(_whole_number(1)),

@@ -213,7 +213,7 @@ def _fuse_sources(
         else:
             points[stages[source]] = merge_surfaces(points["sensor"], points_of(volumes[-1]))
 
-    options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
+    options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps", "weight")} | {"progress": progress}
     options |= {
         "sigma_m": settings["sensor_sigma_m"],
         "sigma_rel": settings["sensor_sigma_rel"],

@@ -221,6 +221,7 @@ def fuse_recording_grids(
     min_conf: int = 1,
     min_maps: int = 2,
     max_reach: float = 3.0,
+    weight: str = "variance",
     after: Callable[[int, list[Volume]], None] = lambda _source, _volumes: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
 ) -> list[Volume]:
@@ -242,7 +243,7 @@ def fuse_recording_grids(
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
         min_maps: swept maps that must agree on a surface without other depth; if there are fewer, all of them.
-        max_reach: in truncations; depth whose twofold sigma exceeds it is left out.
+        max_reach, weight: of :func:`dhtorch.integrate.fuse_views`.
         after: called after each source with (codes.Source, volumes).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
@@ -250,6 +251,7 @@ def fuse_recording_grids(
         Volumes; recovered points are discs of 1.5 voxels, added where the sensor has no usable return.
     """
     *finer, volume = volumes
+    fuse = partial(fuse_views, max_reach=max_reach, weight=weight)
     maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
     for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
         volume = reserve_blocks(volume, view_from_sweep(recording, answer, places), max_reach=max_reach)
@@ -258,29 +260,29 @@ def fuse_recording_grids(
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
             *finer, volume = (
-                _fuse_sensor(v, frame, places.poses[k], recording.sparse, noise) for v in (*finer, volume)
+                _fuse_sensor(v, frame, places.poses[k], recording.sparse, noise, weight) for v in (*finer, volume)
             )
         after(Source.SENSOR, [*finer, volume])
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
             view = view_from_recovered(answer, places.poses[answer.pair[0]], radius=_PATCH_RADIUS_VOXELS * volume.voxel)
-            volume = fuse_views(volume, view, source=Source.RECOVERED, max_reach=max_reach)
+            volume = fuse(volume, view, source=Source.RECOVERED)
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
-            volume = fuse_views(
-                volume, view_from_sweep(recording, answer, places), source=Source.SWEPT, max_reach=max_reach
-            )
+            volume = fuse(volume, view_from_sweep(recording, answer, places), source=Source.SWEPT)
         volume = drop_unconfirmed(volume, max(1, min(min_maps, len(maps))))
         after(Source.SWEPT, [*finer, volume])
     return [*finer, volume]
 
 
-def _fuse_sensor(volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any]) -> Volume:
+def _fuse_sensor(
+    volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any], weight: str
+) -> Volume:
     """The volume after fusion of one frame's sensor depth."""
     radius = _PATCH_RADIUS_VOXELS * volume.voxel if sparse else None
-    return fuse_views(volume, view_from_sensor(frame, T_world_from_cam, radius=radius, **noise))
+    return fuse_views(volume, view_from_sensor(frame, T_world_from_cam, radius=radius, **noise), weight=weight)
 
 
 def measure_coverage(xyz: Tensor, cell: float) -> dict[str, Any]:

@@ -29,6 +29,8 @@ BLOCK_VOXELS = BLOCK_SIDE**3
 _BLOCKS_PER_CHUNK = 1024
 #: Sources of depth with separate weights, in the order of ``Volume.weight``.
 VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
+#: What the weight of an observation follows: the variance of its depth, or its confidence.
+WEIGHTINGS = ("variance", "confidence")
 
 
 @record
@@ -99,8 +101,9 @@ def fuse_views(
     source: int = Source.SENSOR,
     max_reach: float = 3.0,
     carve: bool = True,
+    weight: str = "variance",
 ) -> Volume:
-    """The volume after fusion of B more views: the mean of all distances, weighted by 1/sigma².
+    """The volume after fusion of B more views: the mean of all distances, weighted by 1/sigma² or by confidence.
 
     Every voxel of a block in sight is projected into the view and reads the nearest pixel. Its distance to the surface
     there is clamped to the truncation. Behind the surface it is updated as far as the reach, twice sigma but at least
@@ -113,23 +116,27 @@ def fuse_views(
         source: of their depth, Source.SENSOR, RECOVERED or SWEPT; selects the weight that is increased.
         max_reach: in truncations; depth whose twofold sigma exceeds it is left out.
         carve: False = voxels in front of the surface by more than the reach are unchanged.
+        weight: ``variance``, 1/sigma²; ``confidence``, the last feature of a pixel, 0 to 1, over the squared side of a
+            voxel, as of depths that are all equally precise: the sigma of the surface is then no standard deviation.
 
     Returns:
         Volume with the blocks that the views' surfaces pass through. Depths that are not finite, not positive or
         without a usable sigma, views without a finite pose, and points beyond the grid's range are ignored.
 
     Raises:
-        ValueError: wrong shapes, or another source.
+        ValueError: wrong shapes, another source or weight.
 
     Gradient: none.
     Cost: per view, one projection for each voxel of the blocks in sight.
-    Source: B. Curless, M. Levoy 1996; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed.
+    Source: B. Curless, M. Levoy 1996; weight by confidence: the paper, "Global integration (scope note)"; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed.
     """
     _check_view(volume, view)
     if source not in VOLUME_SOURCES:
         raise ValueError(f"fuse_views: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
+    if weight not in WEIGHTINGS:
+        raise ValueError(f"weight: found {weight!r}, expected {' or '.join(WEIGHTINGS)}")
     with torch.no_grad():
-        integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach, weight) for b in range(len(view.depth))]
         volume = _grow(volume, [i.blocks() for i in integrators])
         for integrator in integrators:
             integrator.add_to(volume, VOLUME_SOURCES.index(source), carve)
@@ -227,7 +234,7 @@ def splat_points(
 class _ViewIntegrator:
     """Fusion of one view (B = 1) into a volume."""
 
-    def __init__(self, volume: Volume, view: DepthView, max_reach: float) -> None:
+    def __init__(self, volume: Volume, view: DepthView, max_reach: float, weight: str = "variance") -> None:
         self.voxel, self.truncation = volume.voxel, volume.truncation
         h, w = view.depth.shape[-2:]
         self.hw, self.camera = (h, w), view.camera
@@ -239,7 +246,8 @@ class _ViewIntegrator:
         usable &= self.R.isfinite().all() & self.t.isfinite().all()
         self.pixel = usable.nonzero()[:, 0]
         self.depth = torch.where(usable, depth, 0.0)
-        self.precision = torch.where(usable, 1 / sigma.square(), 0.0)
+        by_confidence = view.features[..., -1].flatten().nan_to_num().clamp(0, 1) / volume.voxel**2
+        self.precision = torch.where(usable, 1 / sigma.square() if weight == "variance" else by_confidence, 0.0)
         self.features = torch.nn.functional.pad(view.features.reshape(h * w, -1), (1, 0), value=1.0)
         edge = cameras.rays(view.camera, _border_pixels(h, w).to(view.camera.f)[None])[0]
         self.extent = edge[edge.isfinite().all(-1)].abs().amax(0)[:2] if len(edge) else edge.new_zeros(2)

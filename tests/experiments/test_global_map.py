@@ -38,6 +38,18 @@ def test_four_maps_of_one_room(outcome):
     assert links == [[0, 2], [1, 3], [0, 1], [1, 2], [2, 3]]
 
 
+def test_the_weight_of_the_maps_can_be_the_confidence(outcome):
+    other = experiment.run(
+        [room_scene(room(), gap=2)], {"paper": configured_method()}, by_gap, Settings(), n=700, voxel=0.03,
+        weight="confidence",
+    )  # fmt: skip
+    for variant in ("sensor device", "fused device"):
+        ours, theirs = (o.scenes(variant, experiment.MAP_TRUTH)["synthetic_room"]["n_voxels"] for o in (other, outcome))
+        assert ours == pytest.approx(theirs, rel=0.2), "the same frames"
+    fused = [o.scenes("fused device", experiment.MAP_TRUTH)["synthetic_room"] for o in (other, outcome)]
+    assert fused[0] != fused[1], "another weight is another surface"
+
+
 def test_without_a_trajectory_there_are_maps_of_estimated_poses_alone():
     blind = Changed(room(n_frames=3), poses=None)
     found = asked(blind)

@@ -195,6 +195,25 @@ def test_overlap_is_blended_by_precision_and_order_does_not_matter():
     assert float(sigma.median()) == pytest.approx(1 / math.sqrt(1 / 0.01**2 + 1 / 0.02**2), rel=0.05)
 
 
+def test_overlap_is_blended_by_confidence_where_that_is_the_weight():
+    """The score is the last feature; sigma, which says the opposite here, does not count."""
+    near, far = wall(2.00, sigma=0.02, colour=0.8), wall(2.03, sigma=0.01, colour=0.2)
+
+    def fused(*views):
+        volume = make_volume(0.02, channels=1)
+        for each in views:
+            volume = fuse_views(volume, each, weight="confidence")
+        return extract_points(volume)
+
+    expected = (2.00 * 0.8 + 2.03 * 0.2) / (0.8 + 0.2)
+    assert height(fused(near, far)) == pytest.approx(expected, abs=0.002)
+    assert height(fused(far, near)) == pytest.approx(height(fused(near, far)), abs=1e-5)
+    assert len(fused(near, wall(2.03, colour=0.0)).xyz) and not len(fused(wall(2.03, colour=0.0)).xyz)
+    assert float(fused(near, far).sigma.median()) == pytest.approx(0.02, rel=0.05), "voxel / sqrt(sum of confidences)"
+    with pytest.raises(ValueError, match="weight: found 'score', expected variance or confidence"):
+        fuse_views(make_volume(0.02, channels=1), near, weight="score")
+
+
 def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
     both = collate([wall(2.0), wall(2.02)])
     together = fuse_views(make_volume(0.02, channels=1), both)

@@ -145,6 +145,7 @@ def command(tmp_path, monkeypatch, capsys):
         ("dense=often", "dense: found 'often', expected true, false or options"),
         ("dense={planse: 32}", "dense: found 'planse', expected some of source_views"),
         ("dense={planes: few}", "dense.planes: found 'few', expected a whole number"),
+        ("weight=score", "weight: found 'score', expected variance or confidence"),
         ("min_maps=0", "min_maps: found 0, expected a whole number of at least 1"),
     ],
 )

@@ -64,6 +64,7 @@ def run(
     *,
     n: int = 2048,
     voxel: float = 0.02,
+    weight: str = "variance",
     progress: Progress = no_progress,
 ) -> Outcome:
     """Voxels and islands of four maps per recording: with or without recovered points, device or chained poses.
@@ -80,6 +81,7 @@ def run(
             :func:`dhtorch.integrate.recording.linking_pairs`.
         n: samples of a pair.
         voxel: side of a voxel, in median depths.
+        weight: of :func:`dhtorch.integrate.fuse_views`: ``variance`` or, as the paper's text has it, ``confidence``.
 
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
@@ -105,7 +107,8 @@ def run(
 
     def whole(scene: Scene, _results: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         recording, of_item = scene.recording, estimates.pop(scene.name, {})
-        maps = _Maps(recording, [of_item[p] for p in to_fixed_pairs(pairs(scene))], settings.cutoff_of(scene), voxel)
+        answers = [of_item[p] for p in to_fixed_pairs(pairs(scene))]
+        maps = _Maps(recording, answers, settings.cutoff_of(scene), voxel, weight)
         rows: dict[str, Row] = {}
         for poses in POSE_SOURCES:
             if poses == "anchored" or recording.poses is not None:
@@ -141,8 +144,10 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 class _Maps:
     """Builder and metrics of the maps of one recording."""
 
-    def __init__(self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float) -> None:
-        self.recording, self.answers, self.cutoff = recording, answers, cutoff
+    def __init__(
+        self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float, weight: str
+    ) -> None:
+        self.recording, self.answers, self.cutoff, self.weight = recording, answers, cutoff, weight
         depth = recording[0].depth
         valid = depth[depth.isfinite() & (depth > 0)]
         self.voxel = voxel * (float(valid.median()) if len(valid) else 1.0)
@@ -151,7 +156,8 @@ class _Maps:
         """Poses → rows of the sensor's map and of the fused map along them."""
         sensor_voxels = self.covered(self.fused(places, [Source.SENSOR], None))
         near = self.fused(places, [Source.SENSOR], self.cutoff)
-        fused = fuse_recording(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
+        recovered = {"sources": [Source.RECOVERED], "weight": self.weight}
+        fused = fuse_recording(self.recording, near, self.answers, places, **recovered)
         total = len(places.poses) + places.n_unplaced
         common: Row = {"n_fragments": places.n_fragments, "placed_share": len(places.poses) / max(total, 1)}
         rows = {}
@@ -170,7 +176,8 @@ class _Maps:
     def fused(self, places: PlacedFrames, sources: Sequence[int], cutoff: float | None) -> integrate.Volume:
         """New map along ``places``, of the given sources of depth."""
         empty = integrate.make_volume(self.voxel)
-        return fuse_recording(self.recording, empty, self.answers, places, sources=sources, cutoff=cutoff)
+        options: dict[str, Any] = {"sources": sources, "cutoff": cutoff, "weight": self.weight}
+        return fuse_recording(self.recording, empty, self.answers, places, **options)
 
     def covered(self, volume: integrate.Volume) -> Tensor:
         """Indices of the voxels that the map's surface passes through."""
