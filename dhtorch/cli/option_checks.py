@@ -176,21 +176,30 @@ def quote_value(text: str) -> str:
     return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", r"\'") + "'"
 
 
-def validate_choices(argv: Sequence[str], folder: Path) -> None:
-    """Reject an unknown choice of a settings group.
+def list_choices(argv: Sequence[str], folder: Path) -> dict[str, list[str]]:
+    """Settings group → the chosen names, of a sweep all of them: ``a,b``, ``choice(a,b)`` and ``glob(a*)``.
 
     Raises:
-        ValueError: names the nearest and all valid choices.
+        ValueError: a name that the group does not have, with the nearest and all valid ones; a pattern without a match.
     """
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
+    from hydra.core.override_parser.types import ChoiceSweep, Glob  # noqa: PLC0415
+
+    parser, chosen = OverridesParser.create(), {}
     for word in argv:
-        key, sign, value = word.lstrip("+").partition("=")
-        if not sign or not (folder / key).is_dir() or "/" in key:
+        key, sign, text = word.lstrip("+").partition("=")
+        if not sign or "/" in key or not key or not (folder / key).is_dir():
             continue
-        choices = sorted(p.stem for p in (folder / key).glob("*.yaml"))
-        for choice in value.strip("'\"").split(","):
-            if choice.strip() not in choices and not choice.strip().startswith(("[", "{", "choice(", "glob(")):
-                actual = f"{key}: found {choice!r}{console.suggest_name(choice, choices)}"
-                raise ValueError(f"{actual}, expected one of {', '.join(choices)}")
+        names, value = sorted(p.stem for p in (folder / key).glob("*.yaml")), parser.parse_override(word).value()
+        if isinstance(value, Glob):
+            value = value.filter(names) or [text]
+        value = value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]
+        chosen[key] = [str(getattr(each, "text", each)) for each in value]
+        for name in chosen[key]:
+            if name not in names:
+                actual = f"{key}: found {name!r}{console.suggest_name(name, names)}"
+                raise ValueError(f"{actual}, expected one of {', '.join(names)}")
+    return chosen
 
 
 def validate_option_names(

@@ -88,6 +88,9 @@ _LOG = logging.getLogger("dhtorch.cli.run")
 #: Option of a single choice of the group ``pairs`` → that choice, which the option implies.
 _IMPLIED_CHOICES = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
+#: What Hydra's deletion of the group ``holdout`` stands for: every other group is needed.
+_NO_HOLDOUT = "holdout=none"
+
 #: Hydra flags that print information and run no job.
 _HYDRA_INFO_FLAGS = {"--hydra-help", "-sc", "--shell-completion", *commands.HYDRA_VALUE_FLAGS}
 _HELP_FLAGS = {"-h", "--help", "--help-all"}
@@ -160,6 +163,7 @@ def _dispatch(argv: list[str]) -> int:
         return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
     if name == "run":
         argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
+        argv = [_NO_HOLDOUT if a.partition("=")[0] == "~holdout" else a for a in argv]
         words.validate_words(argv, ["PATH", *(each for each in commands.COMMANDS if each != "recover")])
         return _run_hydra(argv)
     return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
@@ -173,14 +177,16 @@ def _format_version() -> str:
 
 def _is_capture(argv: Sequence[str]) -> bool:
     """Whether the first argument is an existing path and no sub-command."""
-    return bool(argv) and argv[0][:1] not in "-+" and Path(argv[0]).expanduser().exists()
+    return bool(argv) and not _is_flag_or_deletion(argv[0]) and Path(argv[0]).expanduser().exists()
 
 
 def _reject_missing_path(word: str) -> None:
     """Raise an error for a first argument that looks like a path and does not exist."""
+    if _is_flag_or_deletion(word):
+        return
     path = Path(word).expanduser()
     looks_like_path = bool({*_SEPARATORS} & {*word}) or word.startswith("~") or bool(_FILE_END.search(word))
-    is_option = word.startswith(("-", "+", "hydra/")) or ("=" in word and not word.startswith((*_SEPARATORS, "~", ".")))
+    is_option = word.startswith("hydra/") or ("=" in word and not word.startswith((*_SEPARATORS, "~", ".")))
     if is_option or path.exists():
         return
     near = console.suggest_path(path)
@@ -351,15 +357,14 @@ def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
 
     folder = config_dir()
     groups = [p.name for p in folder.iterdir() if p.is_dir()]
-    words.validate_choices(argv, folder)
-    chosen = [a for a in argv if a.partition("=")[0] in groups]
-    first = [a.partition(",")[0] if "[" not in a else a for a in chosen]
+    chosen = words.list_choices(argv, folder)
+    first = [f"{group}={names[0]}" for group, names in chosen.items()]
     composed: Any = OmegaConf.to_container(hydra.compose(name, first))
-    swept = [
-        (group, choice) for group, _, choices in (a.partition("=") for a in chosen) for choice in choices.split(",")[1:]
-    ]
     swept_names = [
-        f"{g}.{k}" for g, c in swept for k in words.iter_option_names(_load_settings(folder / g / f"{c.strip()}.yaml"))
+        f"{group}.{option}"
+        for group, names in chosen.items()
+        for other in names[1:]
+        for option in words.iter_option_names(_load_settings(folder / group / f"{other}.yaml"))
     ]
     readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else []
     words.validate_option_names(
@@ -398,9 +403,13 @@ def _name_positionals(name: str, argv: Sequence[str]) -> list[str]:
 
 
 def _is_positional(word: str) -> bool:
-    """Whether an argument is a path and neither an option, a flag nor a deletion (``~group``; ``~/`` is a path)."""
-    is_deletion = word.startswith("~") and not word.startswith("~/")
-    return not is_deletion and not word.startswith(("-", "+")) and ("=" not in word or Path(word).exists())
+    """Whether an argument is a path and neither an option nor a flag."""
+    return not _is_flag_or_deletion(word) and ("=" not in word or Path(word).exists())
+
+
+def _is_flag_or_deletion(word: str) -> bool:
+    """Whether an argument is a flag, an addition or a deletion (``~group``; ``~/`` is a path)."""
+    return word.startswith(("-", "+")) or (word.startswith("~") and not word.startswith("~/"))
 
 
 def _lacks_result(word: str) -> bool:
@@ -478,10 +487,10 @@ def _run_hydra(argv: list[str]) -> int:
 
 def _check_sweep_files(output: OutputFolder) -> None:
     """Raise FileExistsError for a link or a foreign file where a sweep writes beside its jobs."""
-    table, settings = output.path / "sweep.csv", output.path / "multirun.yaml"
+    table, picture, settings = (output.path / name for name in ("sweep.csv", "sweep.png", "multirun.yaml"))
     if output.is_unlisted and any(output.path.glob("*/result.json")):  # of an older version, without a manifest
         output.adopt([table, settings])
-    output.check([table])
+    output.check([table, picture])
     output.claim(settings)  # written by Hydra
 
 
@@ -530,9 +539,11 @@ def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_comma
 
 def _count_jobs(overrides: Sequence[str]) -> int:
     """Number of jobs of a sweep: all combinations."""
+    from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
     from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
 
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    parsed = parser.parse_overrides(list(overrides))
     return math.prod(len(list(o.sweep_string_iterator())) for o in parsed if o.is_sweep_override())
 
 

@@ -25,6 +25,7 @@ DEPTH_METRICS = (
     MainMetric("coverage", larger_is_better=True),
     MainMetric("median_rel", larger_is_better=False),
     MainMetric("p90_rel", larger_is_better=False),
+    MainMetric("corr", larger_is_better=True),
     MainMetric("coverage_at_5", larger_is_better=True),
     MainMetric("ms", larger_is_better=False),
 )

@@ -50,6 +50,8 @@ from dhtorch.synthetic.recording import SyntheticRoom
         (["integrate", "vxel=1"], "vxel", "voxel"),
         (["complete", "nowhere"], "out", "out=VALUE"),
         (["-m", "seed=0,1", "pairs.gp=3"], "pairs.gp", "pairs.gap"),
+        (["-m", "method=choice(paper,mop)"], "method", "map"),
+        (["-m", "method=glob(zz*)"], "method", "one of auto"),
     ],
 )
 def test_a_slip_is_said_in_one_line_before_any_work(command, monkeypatch, typed, begins, near):
@@ -127,6 +129,36 @@ def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):
     assert command("inspect", str(tmp_path / "one"), "data.register=false", "--out", str(tmp_path / "sheet"))[0] == 0
     code, _, err = command("inspect", str(tmp_path / "one"), "data.registr=false")
     assert code == 2 and "did you mean register?" in err
+
+
+@pytest.mark.parametrize(
+    ("typed", "methods"),
+    [
+        ("method=choice(paper,map)", ["paper", "map"]),
+        ("method=glob(map*)", ["map", "map_1"]),
+        ("method=glob([map*,opencv],exclude=map_1)", ["map", "opencv"]),
+    ],
+)
+def test_the_sweeps_of_hydra_choose_groups(command, monkeypatch, typed, methods):
+    chosen = []
+
+    def run(_settings, _parts, choices, folder, **_):
+        chosen.append(choices["method"])
+        return job.JobStatus(str(folder), "failed", "not run")
+
+    monkeypatch.setattr(job, "run", run)
+    _, out, _ = command("-m", typed, "method.n=64", "output=o")
+    assert chosen == methods and f"{len(methods)} jobs" in out
+
+
+def test_deleting_the_holdout_is_no_holdout(command, monkeypatch):
+    seen = []
+    monkeypatch.setattr(job, "run", lambda s, _, c, f, **__: seen.append((s["holdout"], c)) or job.JobStatus(str(f), "x"))
+    for typed in ("~holdout", "~holdout=range", "holdout=none"):
+        assert command(typed, "output=o")[0] == 0
+    assert seen[0] == seen[1] == seen[2] and seen[0][0]["cutoff"] == float("inf")
+    code, out, err = command("~holdout", "--cfg", "job")
+    assert code == 0 and "cutoff: .inf" in out, err
 
 
 def test_names_of_places_are_one_text():

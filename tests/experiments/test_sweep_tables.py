@@ -21,7 +21,8 @@ from dhtorch.experiments.probes.probing import (
     record_probes,
     summarise_over_scenes,
 )
-from dhtorch.experiments.report import jobs
+from dhtorch.experiments import report
+from dhtorch.experiments.report import job_figure, jobs, page
 from dhtorch.experiments.report.cells import EMPTY_CELL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,3 +113,54 @@ def test_a_result_that_names_no_metric_still_has_a_table() -> None:
     assert [metric.name for metric in jobs.main_metrics([result])][:2] == ["mse", "vs_context"]
     table = jobs.jobs_table([result, result])
     assert table is not None and not table.best, "which side is better is unknown"
+
+
+def depth_result(method: str, n: int | str, coverage: float) -> dict[str, Any]:
+    """Result of the main job with one variant and its main metrics."""
+    numbers = {"coverage": coverage, "median_rel": 0.1 - coverage / 20, "corr": coverage - 0.1, "ms.track": 100.0}
+    summary = {name: {"value": v, "low": None, "high": None, "n": 1, "unit": "1"} for name, v in numbers.items()}
+    return {
+        "experiment": "pair",
+        "config": {"method": {"n": n}, "pairs": "gap"},
+        "data": {"name": "room"},
+        "rows": [{"scene": "room", "pair": None, "method": method, **numbers}],
+        "summary": summary,
+        "metrics": [vars(metric) for metric in DEPTH_METRICS],
+    }
+
+
+def test_a_sweep_of_a_number_is_drawn_along_it_with_a_curve_for_every_method() -> None:
+    results = [depth_result(m, n, c) for m, c in (("paper", 0.5), ("map", 0.7)) for n in (256, 4096, 1024)]
+    table = jobs.jobs_table(results)
+    assert table is not None and "corr" in table.head, "the correlation is a column"
+    figure = job_figure.sweep_figure(results)
+    assert figure is not None and [key.text for key in figure.legend] == ["paper", "map"]
+    assert [panel.title for panel in figure.panels] == ["coverage, %", "median, %", "corr", "ms"]
+    for panel in figure.panels:
+        assert panel.x.label == "method.n" and panel.x.log, "values over more than a decade"
+        lines = [mark for mark in panel.marks if mark.kind == "line"]
+        assert len(lines) == 2 and all([u for u, _ in m.places] == sorted(u for u, _ in m.places) for m in lines)
+        assert len([mark for mark in panel.marks if mark.kind == "dot"]) == 6
+    tips = [mark.tooltip for mark in figure.panels[0].marks if mark.tooltip]
+    assert "map method.n 4096: 70.0 %" in tips
+
+
+def test_a_sweep_of_names_is_a_chart_and_one_job_is_no_sweep(tmp_path: Path) -> None:
+    results = [depth_result(m, 256, c) for m, c in (("paper", 0.5), ("map", 0.7))]
+    figure = job_figure.sweep_figure(results)
+    assert figure is not None and not figure.legend and figure.panels[0].rows == ["paper", "map"]
+    assert job_figure.sweep_figure(results[:1]) is None and not job_figure.draw_sweep(tmp_path / "x.png", results[:1])
+    assert not (tmp_path / "x.png").exists()
+    intervals = job_figure.sweep_figure([probe_result(1, 0), probe_result(1, 1)])
+    assert intervals is not None and sum(mark.kind == "line" for mark in intervals.panels[0].marks) == 16
+
+
+def test_the_curves_of_a_sweep_stand_beside_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = [depth_result("map", n, 0.5 + n / 4096) for n in (256, 512)]
+    report.print_sweep(results, tmp_path)
+    assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG") and "and sweep.png" in capsys.readouterr().out
+    assert page._sweep(results, jobs.jobs_table(results)).count("<svg") == 4
+    for result in results:
+        result["config"]["figures"] = False
+    report.print_sweep(results, tmp_path / "bare")
+    assert sorted(p.name for p in (tmp_path / "bare").glob("*.*")) == [".dhtorch", "sweep.csv"]

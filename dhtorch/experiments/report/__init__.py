@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dhtorch.experiments.report import jobs, page, text
+from dhtorch.experiments.report import job_figure, jobs, page, text
 from dhtorch.experiments.report.advice import advice
 from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
 from dhtorch.experiments.report.reading import Result, describe_result
@@ -75,7 +75,10 @@ def _shorten_table(table: ReportTable) -> ReportTable:
 
 
 def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:
-    """Print the table of a sweep's jobs and write it beside them as ``sweep.csv``; nothing for fewer than two."""
+    """Print the table of a sweep's jobs and write it beside them as ``sweep.csv`` and, as curves, ``sweep.png``.
+
+    Nothing for fewer than two jobs; no picture where every job has ``figures=false``.
+    """
     table = jobs.jobs_table(results)
     if table is None:
         return
@@ -86,6 +89,9 @@ def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = Fal
     try:
         with open_output_folder(folder, "folder"):
             message = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
+            pictured = any(result["config"].get("figures", True) for result in results)
+            if pictured and job_figure.draw_sweep(folder / "sweep.png", results):
+                message += " and sweep.png"
     except OSError as error:  # a read-only folder, a sweep that is running, a foreign file
         message = f"{folder}: no sweep.csv written ({error.strerror or error})"
     if not markdown:

@@ -30,7 +30,7 @@ _STAGE_TIMES = "ms."
 _IGNORED_SETTINGS = ("output", "resume", "traceback", "figures", "workers", "threads", "launch")
 
 #: Groups of settings with named choices; their members are listed only if they differ under the same name.
-_NAMED_GROUPS = ("method", "data", "pairs", "experiment")
+NAMED_GROUPS = ("method", "data", "pairs", "experiment")
 
 
 def differing_settings(results: Sequence[Result]) -> list[dict[str, str]]:
@@ -38,7 +38,7 @@ def differing_settings(results: Sequence[Result]) -> list[dict[str, str]]:
     choices = [_group_choices(result) for result in results]
     flat = [dict(_flatten_config(result["config"])) for result in results]
     differing: list[dict[str, str]] = [{} for _ in results]
-    for group in _NAMED_GROUPS:
+    for group in NAMED_GROUPS:
         if len({choice[group] for choice in choices}) > 1:
             for row, choice in zip(differing, choices, strict=True):
                 row[group] = choice[group]

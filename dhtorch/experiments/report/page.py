@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
-from dhtorch.experiments.report import jobs, published
+from dhtorch.experiments.report import job_figure, jobs, published
 from dhtorch.experiments.report.figure import Figure
 from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
 from dhtorch.experiments.report.plots import result_figures
@@ -42,7 +42,7 @@ def render_report(results: Sequence[Result]) -> str:
     sections = [_section(result, name) for result, name in zip(results, names, strict=True)]
     skip = make_tag("a", "To the results", href=f"#{names[0]}" if names else "#", class_="skip")
     swept = jobs.jobs_table(results)
-    sweep = table_markup(swept) if swept and _is_one_sweep(results) else ""
+    sweep = _sweep(results, swept) if swept and _is_one_sweep(results) else ""
     overview = _overview(results, names)
     if any(layout_tables(result) for result in results):
         top = make_tag("header", make_tag("h1", title), make_tag("p", _about(results), class_="lead"), sweep, overview)
@@ -50,6 +50,12 @@ def render_report(results: Sequence[Result]) -> str:
     # without lines of the paper the numbers come first
     top = make_tag("header", make_tag("h1", title), sweep)
     return build_document(title, skip, top, make_tag("main", *sections), make_tag("footer", overview), own=PAGE_CSS)
+
+
+def _sweep(results: Sequence[Result], table: ReportTable) -> Markup:
+    """Table of the jobs of a sweep, and their curves along the swept option."""
+    figure = job_figure.sweep_figure(results)
+    return join_markup((table_markup(table), figures_markup([figure]) if figure else ""))
 
 
 def _is_one_sweep(results: Sequence[Result]) -> bool:

@@ -21,7 +21,7 @@ from dhtorch.viz.plots.canvas import (
 )
 from dhtorch.viz.plots.colours import Stroke, assign_strokes
 from dhtorch.viz.plots.maps import draw_aligned, draw_completed
-from dhtorch.viz.plots.panel import Panel
+from dhtorch.viz.plots.panel import Panel, save_panels
 from dhtorch.viz.plots.pictures import (
     MIN_CURVE_ANSWERS,
     LayeredPicture,
@@ -64,4 +64,5 @@ __all__ = [
     "prefix_title",
     "render_inline_svg",
     "save_figure",
+    "save_panels",
 ]

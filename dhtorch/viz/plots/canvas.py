@@ -56,8 +56,15 @@ class Canvas:
         from matplotlib.transforms import Affine2D  # noqa: PLC0415
 
         self.figure = Figure((width / 72, height / 72), dpi=dpi)
-        self.points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
+        self._canvas_points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
+        self.points = self._canvas_points
         self.tooltips: list[str] = []  # tooltips of the artists named tooltip-0, tooltip-1, …
+
+    def set_origin(self, u: float, v: float) -> None:
+        """Place the origin of what is drawn next at (u, v)."""
+        from matplotlib.transforms import Affine2D  # noqa: PLC0415
+
+        self.points = Affine2D().translate(u, v) + self._canvas_points
 
     def text(
         self, text: str, u: float, v: float, *, size: float = TEXT_SIZE_PT, tooltip: str = "", **options: Any

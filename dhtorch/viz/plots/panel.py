@@ -18,6 +18,7 @@ from dhtorch.viz.plots.canvas import (
     CanvasPoint,
     LegendKey,
     Mark,
+    save_figure,
     to_plain_line,
     truncate_text,
 )
@@ -25,6 +26,8 @@ from dhtorch.viz.plots.colours import FAINT, PAPER_EDGE, PAPER_FILL, Stroke
 
 #: Height of a named row, points.
 _ROW_HEIGHT_PT = 19
+#: Panels beside one another in a picture.
+_PANELS_PER_ROW = 3
 #: Height of the margins around the rows, points.
 _ROWS_MARGIN_PT = 66
 
@@ -142,3 +145,15 @@ class Panel:
         canvas.text(self.x.label, (self.left + right) / 2, 8, ha="center")
         if self.y:
             canvas.text(self.y.label, 12, (base + ceiling) / 2, ha="center", rotation=90)
+
+
+def save_panels(path: Any, panels: Sequence[Panel], keys: Sequence[LegendKey] = ()) -> None:
+    """Write panels, three beside one another, with one legend, as a picture."""
+    rows = [panels[k : k + _PANELS_PER_ROW] for k in range(0, len(panels), _PANELS_PER_ROW)]
+    heights = [max(panel.height for panel in row) for row in rows]
+    canvas = Canvas(max(sum(panel.width for panel in row) for row in rows), sum(heights), dpi=160)
+    for n, row in enumerate(rows):
+        for k, panel in enumerate(row):
+            canvas.set_origin(sum(before.width for before in row[:k]), sum(heights[n + 1 :]))
+            panel.draw(canvas)
+    save_figure(canvas.finished(keys), path)
