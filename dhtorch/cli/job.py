@@ -6,6 +6,7 @@ The result is written last, after its figures: a folder with a valid ``result.js
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +19,7 @@ from dhtorch.data import scenes_of
 from dhtorch.data.io import decode as data_files
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import report
+from dhtorch.experiments.finished_scenes import FinishedScenes
 from dhtorch.experiments.focal.stacks import FocalStacks
 from dhtorch.experiments.pictures import draw_example
 from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
@@ -25,12 +27,15 @@ from dhtorch.ops import loader
 from dhtorch.runtime import console, storage
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
-from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER, OutputFolder, open_output_folder
 
 _LOG = logging.getLogger(__name__)
 
 #: File beside a result with the path of its data on this machine.
 DATA_ROOT_FILE = "data_root.txt"
+
+#: Folder of the scenes that an unfinished job has finished, below its own.
+_SCENES_FOLDER = Path(PRIVATE_FOLDER, "scenes")
 
 #: The settings groups; their names enter the key of a result.
 SETTINGS_GROUPS = ("method", "data", "pairs", "holdout", "experiment")
@@ -94,7 +99,7 @@ def _check_files(output: OutputFolder, target: Path, data_sets: Sequence[Scene] 
         with contextlib.suppress(ValueError, OSError):
             result_files.read_result(target)
             output.adopt(folder.rglob("*"))  # a result of an older version, without a manifest
-    output.check_folders(folder / data_set.name for data_set in data_sets)
+    output.check_folders([folder / _SCENES_FOLDER, *(folder / data_set.name for data_set in data_sets)])
     output.check([target, folder / DATA_ROOT_FILE])
 
 
@@ -112,7 +117,9 @@ def _write_result(
     target, key, digest = place
     folder = target.parent
     methods = {names["method"]: parts["method"]}
-    outcome = parts["experiment"](data_sets, methods, parts["pairs"], _make_pair_settings(settings), progress=progress)
+    finished = FinishedScenes(folder / _SCENES_FOLDER, _scenes_key(settings, key), reuse=settings["resume"])
+    pair_settings = _make_pair_settings(settings, finished)
+    outcome = parts["experiment"](data_sets, methods, parts["pairs"], pair_settings, progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
     drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
@@ -121,6 +128,7 @@ def _write_result(
     result = _build_result(settings, names["experiment"], key, data, outcome)
     _write_data_root(folder, settings)
     result_files.write_result(target, result)
+    finished.remove()
     _print_result(result, [target, *drawn], swept=swept)
     return JobStatus(str(folder), "finished")
 
@@ -128,17 +136,10 @@ def _write_result(
 def _build_result(
     settings: Mapping[str, Any], experiment: str, key: str, data: Mapping[str, Any], outcome: Outcome
 ) -> dict[str, Any]:
-    threads = torch.get_num_threads()
     return result_files.build_result(
         experiment=experiment,
         key=key,
-        meta=result_files.collect_run_metadata(
-            device=settings["device"],
-            dtype=settings["dtype"],
-            threads=threads,
-            seed=settings["seed"],
-            operators=loader.describe(),
-        ),
+        meta=_collect_metadata(settings),
         config=settings,
         data=data,
         summary=outcome.summary,
@@ -179,7 +180,20 @@ def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: 
     print(f"wrote {written[0]}{figures}")
 
 
-def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
+def _scenes_key(settings: Mapping[str, Any], key: str) -> str:
+    """Key of the scenes of a job: that of its result, and the machine and libraries on which their last bits depend."""
+    meta = _collect_metadata(settings)
+    return hashlib.sha256(repr((key, {k: v for k, v in meta.items() if k != "utc"})).encode()).hexdigest()
+
+
+def _collect_metadata(settings: Mapping[str, Any]) -> dict[str, Any]:
+    options = {name: settings[name] for name in ("device", "dtype", "seed")}
+    return result_files.collect_run_metadata(
+        **options, threads=torch.get_num_threads(), operators=loader.describe()
+    )
+
+
+def _make_pair_settings(settings: Mapping[str, Any], finished: FinishedScenes) -> Settings:
     """The options shared by all pairs of the job."""
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
@@ -202,6 +216,7 @@ def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
         batch=settings["batch"],
         workers=settings["workers"],
         between=settings["between"],
+        finished=finished,
     )
 
 

@@ -498,7 +498,8 @@ def _run_single(engine: Any, overrides: Sequence[str], resume_command: str) -> i
     try:
         status = engine.run("run", _run_hydra_job, list(overrides)).return_value
     except KeyboardInterrupt:
-        print(f"dhtorch: interrupted, no result written. To run it again:\n  {resume_command}", file=sys.stderr)
+        go_on = "Finished scenes are kept. To run the rest:"
+        print(f"dhtorch: interrupted, no result written. {go_on}\n  {resume_command}", file=sys.stderr)
         return EXIT_INTERRUPTED
     return EXIT_FAILED if status.state == "failed" else EXIT_DONE
 

@@ -68,6 +68,13 @@ class Outcome:
     cohort: str = "full"  # the one that the verdict and the numbers of the summary without a cohort are about
     metrics: Sequence[MainMetric] = DEPTH_METRICS  # by which the jobs of a sweep are compared
 
+    def add(self, part: Outcome) -> None:
+        """Add the rows, examples, pairs and points of a part, as of one scene; the summary is not changed."""
+        self.rows += part.rows
+        self.examples += part.examples
+        self.n_pairs += part.n_pairs
+        self.points |= part.points
+
     def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
         """Outcome with the answer to its question: True supported, False refuted, None undecided."""
         words = {True: "supported", False: "refuted", None: "undecided"}
@@ -84,9 +91,7 @@ def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
     parts = list(outcomes)
     joined = Outcome(cohort=parts[0].cohort, metrics=parts[0].metrics) if parts else Outcome()
     for part in parts:
-        joined.rows += part.rows
+        known = {example.scene for example in joined.examples}
+        joined.add(replace(part, examples=[example for example in part.examples if example.scene not in known]))
         joined.summary |= part.summary
-        joined.examples += [e for e in part.examples if e.scene not in {x.scene for x in joined.examples}]
-        joined.n_pairs += part.n_pairs
-        joined.points |= part.points
     return joined

@@ -21,6 +21,7 @@ from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.pairs import Pair, to_fixed_pairs
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.finished_scenes import FinishedScenes
 from dhtorch.experiments.loading import CandidateViews, PairDataset, candidate_views, load_pairs, move_to_device
 from dhtorch.experiments.outcome import Example, Outcome
 from dhtorch.experiments.rows import Row, overlay_points, scene_row, summarise_rows
@@ -61,6 +62,7 @@ class Settings:
     batch: int = 1
     workers: int = 0
     between: int | None = None  # frames between the two of a pair for its tracker, at most; None = as many as it uses
+    finished: FinishedScenes = field(default_factory=FinishedScenes, repr=False, compare=False)  # of an earlier run
 
     def cutoff_of(self, scene: Scene) -> float | None:
         """Cutoff of a scene, m; None where it has no near limit."""
@@ -296,23 +298,27 @@ def run(
     """
     protocol = protocol if protocol.cohorts else replace(protocol, cohorts=range_split_cohorts(settings))
     outcome = Outcome(cohort=list(protocol.cohorts)[-1])
+    keep = settings.finished.loop({name: variant.method for name, variant in protocol.variants.items()})
     for scene in scenes_of(scenes):
-        chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
-        protocol.allows(chosen)
-        collector = _SceneCollector(scene, protocol, settings)
-        views, between = protocol.views(chosen), protocol.between(settings)
-        data = PairDataset(scene.recording, chosen, settings.dtype, views, protocol.offers, between)
-        size = protocol.batch(settings, chosen)
-        loader = load_pairs(data, batch=size, workers=settings.workers)
-        for start, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
-            on_device = move_to_device(tuple(items), settings.device)
-            collector.add(Batch(scene, chosen[start : start + size], collector.cutoff, *on_device))
-        outcome.rows += collector.rows()
-        outcome.examples += collector.examples
-        outcome.n_pairs += len(chosen)
-        outcome.points |= {(scene.name, *k): pytree.collate(p) for k, p in collector.pooled.items()}
+        outcome.add(keep(scene.name, partial(_run_scene, scene, protocol, pairs, settings, progress)))
     outcome.summary = summarise_rows(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
+
+
+def _run_scene(scene: Scene, protocol: Protocol, pairs: ScenePairs, settings: Settings, progress: Progress) -> Outcome:
+    """Rows, example and points of one scene."""
+    chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
+    protocol.allows(chosen)
+    collector = _SceneCollector(scene, protocol, settings)
+    views, between = protocol.views(chosen), protocol.between(settings)
+    data = PairDataset(scene.recording, chosen, settings.dtype, views, protocol.offers, between)
+    size = protocol.batch(settings, chosen)
+    loader = load_pairs(data, batch=size, workers=settings.workers)
+    for start, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
+        on_device = move_to_device(tuple(items), settings.device)
+        collector.add(Batch(scene, chosen[start : start + size], collector.cutoff, *on_device))
+    points = {(scene.name, *k): pytree.collate(p) for k, p in collector.pooled.items()}
+    return Outcome(collector.rows(), examples=collector.examples, n_pairs=len(chosen), points=points)
 
 
 class _SceneCollector:

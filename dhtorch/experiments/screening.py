@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Protocol, TypeVar
 
 import torch
 
+from dhtorch.experiments.finished_scenes import FinishedScenes
 from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Outcome, Progress
 from dhtorch.experiments.rows import Row, mean_or_none, median_or_none, summarise_rows
@@ -39,6 +41,7 @@ def screen_scenes(
     truth: str,
     metrics: Sequence[MainMetric],
     whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _results: {},
+    finished: FinishedScenes,
     progress: Progress,
 ) -> Outcome:
     """Evaluate every item of every scene → rows of items and scenes, and their summary.
@@ -56,31 +59,35 @@ def screen_scenes(
         metrics: main metrics of the experiment.
         whole: scene, results of ``evaluate`` on all its items → variant → numbers that replace those of the scene's
             row.
+        finished: scenes of an interrupted run, of the settings.
         progress: wraps the loop over a scene's items: (items, text, number of items) → items.
     """
-    outcome = Outcome(metrics=metrics)
-    for scene in scenes:
-        chosen = list(items(scene))
+
+    def screen(scene: ScreenedScene) -> Outcome:
+        part, chosen = Outcome(), list(items(scene))
         with torch.no_grad():
             results = [evaluate(scene, item) for item in progress(chosen, scene.name, len(chosen))]
             replacements = whole(scene, results)
         scene_name = {"scene": scene.name}
         for item, result in zip(chosen, results, strict=True):
-            outcome.rows += [
-                {**scene_name, "pair": list(item), "method": v, "truth": truth, **result[v]} for v in result
-            ]
+            part.rows += [{**scene_name, "pair": list(item), "method": v, "truth": truth, **result[v]} for v in result]
         for variant in variants:
             variant_results = [result[variant] for result in results if variant in result]
             row = {**scene_name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
             note = {} if variant_results else {"note": "nothing to ask"}
-            outcome.rows.append(
+            part.rows.append(
                 row
                 | {"n_pairs": len(variant_results)}
                 | note
                 | _join_rows(variant_results)
                 | replacements.get(variant, {})
             )
-        outcome.n_pairs += len(chosen)
+        part.n_pairs = len(chosen)
+        return part
+
+    outcome, keep = Outcome(metrics=metrics), finished.loop()
+    for scene in scenes:
+        outcome.add(keep(scene.name, partial(screen, scene)))
     outcome.summary = summarise_rows(outcome.rows, variants, [truth])
     return outcome
 

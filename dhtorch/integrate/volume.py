@@ -128,7 +128,8 @@ def fuse_views(
 
     Gradient: none.
     Cost: per view, one projection for each voxel of the blocks in sight.
-    Source: B. Curless, M. Levoy 1996; weight by confidence: the paper, "Global integration (scope note)"; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed.
+    Source: B. Curless, M. Levoy 1996; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed; weight by
+    confidence: paper, "Global integration (scope note)".
     """
     _check_view(volume, view)
     if source not in VOLUME_SOURCES:

@@ -153,7 +153,9 @@ def test_the_sweeps_of_hydra_choose_groups(command, monkeypatch, typed, methods)
 
 def test_deleting_the_holdout_is_no_holdout(command, monkeypatch):
     seen = []
-    monkeypatch.setattr(job, "run", lambda s, _, c, f, **__: seen.append((s["holdout"], c)) or job.JobStatus(str(f), "x"))
+    monkeypatch.setattr(
+        job, "run", lambda s, _, c, f, **__: seen.append((s["holdout"], c)) or job.JobStatus(str(f), "x")
+    )
     for typed in ("~holdout", "~holdout=range", "holdout=none"):
         assert command(typed, "output=o")[0] == 0
     assert seen[0] == seen[1] == seen[2] and seen[0][0]["cutoff"] == float("inf")

@@ -522,7 +522,9 @@ def test_the_knee_stands_in_the_table_and_in_the_figures():
     for title in ("Threshold on the score", "Risk against coverage"):
         tips = [mark.tooltip for panel in figures[title].panels for mark in panel.marks if "knee" in mark.tooltip]
         assert tips and layouts.KNEE_DEFINITION in figures[title].caption, title
-    (tip,) = [m.tooltip for p in figures["Threshold on the score"].panels for m in p.marks if "paper, knee" in m.tooltip]
+    (tip,) = [
+        m.tooltip for p in figures["Threshold on the score"].panels for m in p.marks if "paper, knee" in m.tooltip
+    ]
     assert "score from 0.3" in tip
     result["summary"]["paper.at_0.3.median_rel"]["n"] -= 1
     assert layouts.threshold_knee(result, "paper") == "0.1", "a threshold at which a scene is silent is no point"

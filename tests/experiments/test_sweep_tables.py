@@ -13,6 +13,7 @@ import pytest
 import torch
 import yaml
 
+from dhtorch.experiments import report
 from dhtorch.experiments.outcome import DEPTH_METRICS, MainMetric, Outcome
 from dhtorch.experiments.probes.probing import (
     PROBE_ARMS,
@@ -21,7 +22,6 @@ from dhtorch.experiments.probes.probing import (
     record_probes,
     summarise_over_scenes,
 )
-from dhtorch.experiments import report
 from dhtorch.experiments.report import job_figure, jobs, page
 from dhtorch.experiments.report.cells import EMPTY_CELL
 

@@ -18,6 +18,7 @@ sensor here: a near-only fit of a rescaled map is nearly exact, more than a netw
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -132,12 +133,11 @@ def run(
     if size < 16:
         raise ValueError(f"experiment.size: found {size}, expected at least 16")
     method = next(iter(methods.values()))
-    outcome = Outcome(metrics=_METRICS)
-    for scene in scenes_of(scenes):
+
+    def evaluate_scene(scene: Scene) -> Outcome:
         near = settings.cutoff_of(scene)
         if note := _skip_reason(scene, near):
-            outcome.rows.append(_scene_row(scene, _OURS, None) | {"note": note})
-            continue
+            return Outcome([_scene_row(scene, _OURS, None) | {"note": note}])
         assert near is not None
         case_rows: dict[tuple[str, str], list[Row]] = {}
         frames = sorted({pair[0] for pair in protocol.spread_pairs(pairs, reference_views, scene)})
@@ -145,11 +145,15 @@ def run(
             case = _make_case(scene, i, method, settings, near, size=size, swept=swept)
             for name, method_name, row in _evaluate_case(case, names, i):
                 case_rows.setdefault((name, method_name), []).append(row)
-        outcome.n_pairs += len(frames)
-        outcome.rows += [
+        scene_rows = [
             _scene_row(scene, method_name, name) | _mean_over_frames(rows)
             for (name, method_name), rows in case_rows.items()
         ]
+        return Outcome(scene_rows, n_pairs=len(frames))
+
+    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    for scene in scenes_of(scenes):
+        outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_alignment(outcome.rows, names) | leave_one_scene_out(outcome.rows, names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 

@@ -192,8 +192,8 @@ def run(
     selecting_method = with_view_selection(method or next(iter(chosen.values())))
     all_scenes = [scene for scene in scenes_of(scenes) if len(scene.recording) > 1]
     all_scenes += [Scene(_make_room(seed), near=2.0, gap=6) for seed in rooms]
-    outcome = Outcome(metrics=_METRICS)
-    for scene in all_scenes:
+
+    def evaluate_scene(scene: Scene) -> Outcome:
         load = partial(_load_frame, scene, settings)
         reference_rows = []
         for i in progress(
@@ -204,8 +204,12 @@ def run(
         window_rows = [
             r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, load)
         ]
-        outcome.rows += [*reference_rows, *window_rows, _scene_row(scene, reference_rows)]
-        outcome.n_pairs += len(reference_rows)
+        rows = [*reference_rows, *window_rows, _scene_row(scene, reference_rows)]
+        return Outcome(rows, n_pairs=len(reference_rows))
+
+    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    for scene in all_scenes:
+        outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_validation(outcome.rows)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 

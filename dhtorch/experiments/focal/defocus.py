@@ -128,6 +128,7 @@ def run(
         VARIANTS,
         truth="full",
         metrics=_METRICS,
+        finished=settings.finished,
         progress=progress,
     )
     outcome.summary |= {

@@ -110,7 +110,14 @@ def run(
         return _evaluate_frame(image, frame.depth, factor, return_noise, noise, generator)
 
     outcome = screen_scenes(
-        scenes_of(scenes), items, evaluate_item, VARIANTS, truth="left_out", metrics=_METRICS, progress=progress
+        scenes_of(scenes),
+        items,
+        evaluate_item,
+        VARIANTS,
+        truth="left_out",
+        metrics=_METRICS,
+        finished=settings.finished,
+        progress=progress,
     )
     _add_ratios(outcome)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))

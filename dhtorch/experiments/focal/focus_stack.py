@@ -147,6 +147,7 @@ def run(
         truth="full",
         whole=_flip_shares,
         metrics=_METRICS,
+        finished=settings.finished,
         progress=progress,
     )
     for name in variants:

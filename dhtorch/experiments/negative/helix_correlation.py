@@ -124,6 +124,7 @@ def run(
         VARIANTS,
         truth="full",
         metrics=_METRICS,
+        finished=settings.finished,
         progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))

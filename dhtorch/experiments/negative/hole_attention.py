@@ -99,7 +99,14 @@ def run(
         return {v: _count_holes(samples[v], before, cluster, frame.hw) for v in VARIANTS if v in samples}
 
     outcome = screen_scenes(
-        scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, metrics=_METRICS, progress=progress
+        scenes_of(scenes),
+        items,
+        evaluate_item,
+        VARIANTS,
+        truth=_TRUTH,
+        metrics=_METRICS,
+        finished=settings.finished,
+        progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

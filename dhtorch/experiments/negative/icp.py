@@ -134,6 +134,7 @@ def run(
         truth=_TRUTH,
         whole=whole,
         metrics=_METRICS,
+        finished=settings.finished,
         progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))

@@ -117,7 +117,15 @@ def run(
         return rows
 
     outcome = screen_scenes(
-        scenes_of(scenes), items, evaluate, VARIANTS, truth=MAP_TRUTH, whole=whole, metrics=_METRICS, progress=progress
+        scenes_of(scenes),
+        items,
+        evaluate,
+        VARIANTS,
+        truth=MAP_TRUTH,
+        whole=whole,
+        metrics=_METRICS,
+        finished=settings.finished,
+        progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

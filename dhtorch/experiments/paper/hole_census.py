@@ -9,6 +9,7 @@ is below a tenth of that of samples with a return.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -57,16 +58,19 @@ def run(
     Source: paper, "Hole taxonomy".
     """
     name, method = next(iter(methods.items()))
-    outcome = Outcome(metrics=_METRICS)
-    for scene in scenes_of(scenes):
+
+    def count_scene(scene: Scene) -> Outcome:
         recording = scene.recording
         frames = list(range(0, len(recording), stride))
         rows = []
         for i in progress(frames, recording.name, len(frames)):
             rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
             rows[-1] |= count_holes(classify_frame(method, recording[i].to(settings.dtype).to(settings.device)))
-        outcome.rows += [*rows, _join_frames(rows, scene)]
-        outcome.n_pairs += len(rows)
+        return Outcome([*rows, _join_frames(rows, scene)], n_pairs=len(rows))
+
+    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    for scene in scenes_of(scenes):
+        outcome.add(keep(scene.name, partial(count_scene, scene)))
     scene_rows = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
     outcome.summary = errors.summarise_scenes(
         [{k: v for k, v in r.items() if k not in ("pair", "role")} for r in scene_rows]

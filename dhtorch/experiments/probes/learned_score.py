@@ -9,6 +9,7 @@ What would refute it: either ratio is 1 or more. An interval that reaches 1 leav
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
+from dhtorch.experiments.finished_scenes import FinishedScenes
 from dhtorch.experiments.protocol import Batch, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.metrics import bootstrap, risk
 from dhtorch.pipeline.spec import Trace
@@ -78,7 +80,9 @@ def run(
     if method.views > 1:
         raise ValueError(f"experiment.method: found {name}, a method of several views, expected a method of two views")
     answers = _AnswerCache()
-    protocol.run(scenes, Protocol({name: Variant(method)}, {"full": answers.store}), pairs, settings, progress=progress)
+    all_scenes = replace(settings, finished=FinishedScenes())  # the answers of every scene are needed in memory
+    first = Protocol({name: Variant(method)}, {"full": answers.store})
+    protocol.run(scenes, first, pairs, all_scenes, progress=progress)
     options: dict[str, Any] = {"hidden": hidden, "steps": steps, "learning_rate": learning_rate}
     options |= {"weight_decay": weight_decay, "most": most}
     rooms = {scene.name: _room_name(scene) for scene in scenes_of(scenes)}

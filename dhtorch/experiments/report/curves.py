@@ -59,7 +59,10 @@ def risk_figure(result: Result) -> Figure | None:
             panel.dot(c, r, stroke, label, width=KNEE_WIDTH_PT)
 
     caption = "Mean relative error (at most 1) of the most confident answers; logarithmic. A mean over fewer "
-    caption += f"than {MIN_CURVE_ANSWERS} answers is not drawn. Large dot: the knee, {KNEE_DEFINITION}." + " Dashed: the best possible order." * with_oracle
+    caption += (
+        f"than {MIN_CURVE_ANSWERS} answers is not drawn. Large dot: the knee, {KNEE_DEFINITION}."
+        + " Dashed: the best possible order." * with_oracle
+    )
     return _by_scene(result, "Risk against coverage", caption, "risk_coverage", x_axis, y_axis, draw)
 
 

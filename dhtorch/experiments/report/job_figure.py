@@ -30,9 +30,7 @@ def sweep_figure(results: Sequence[Result]) -> Figure | None:
     """
     heads, rows = job_rows(results)
     metrics = [
-        metric.name
-        for metric in main_metrics(results)
-        if sum(_value(row, metric.name) is not None for row in rows) > 1
+        metric.name for metric in main_metrics(results) if sum(_value(row, metric.name) is not None for row in rows) > 1
     ][:_MAX_PANELS]
     if not metrics:
         return None

@@ -191,13 +191,9 @@ def _thresholds(result: Result, variant: str) -> ReportTable | None:
     over = (("", 1), (metric_heading("coverage"), 2), (metric_heading("median_rel"), 2), ("", 1))
     heads = ["score from", OURS_LABEL, PUBLISHED_LABEL, OURS_LABEL, PUBLISHED_LABEL, metric_heading("p90_rel")]
     title = f"Selective threshold, {variant}, medians over scenes"
-    found = f"at {knee}" if knee else "none"
-    note = f"Knee, {KNEE_DEFINITION}, while every scene has answers: {found}. {published_source(result, published.THRESHOLDS)}"
-    return (
-        ReportTable(title, heads, rows, over=over, note=note)
-        if len(rows) > 1
-        else None
-    )
+    note = f"Knee, {KNEE_DEFINITION}, while every scene has answers: {f'at {knee}' if knee else 'none'}. "
+    note += published_source(result, published.THRESHOLDS)
+    return ReportTable(title, heads, rows, over=over, note=note) if len(rows) > 1 else None
 
 
 def threshold_points(result: Result, variant: str) -> list[tuple[str, dict[str, float | None]]]:
