@@ -360,6 +360,19 @@ COMMANDS: dict[str, Command] = {
         ),
         ("html", "markdown", "traceback"),
     ),
+    "fetch": Command(
+        _STUDIES,
+        "the public scenes behind the tables of the docs, licences shown first",
+        "SET",
+        "Downloads the scenes of data=SET from their public addresses: what is there with the right digest stays, an "
+        "interrupted download goes on. Licences and sources are printed first; without --yes they must be accepted at "
+        "the terminal. SET is shared_scenes; data=shared_scenes reads them from the folder that DHTORCH_DATA names.",
+        (
+            ("shared_scenes", "print the licences, ask, download into DHTORCH_DATA"),
+            ("shared_scenes --yes --out DIR", "accept them; another folder"),
+        ),
+        ("out", "yes", "table", "traceback"),
+    ),
 }
 
 #: Option that no settings file describes → its default and description.
@@ -382,6 +395,12 @@ _PARSER_NOTES = {
         "format": OptionNote("auto", "name of the format; auto = recognised from the content"),
         "max_frames": OptionNote("8", "number of frames to decode and show"),
         "follow_links": OptionNote("false", "follow links that lead out of the capture"),
+        "traceback": OptionNote("false", "show the traceback of an error"),
+    },
+    "fetch": {
+        "out": OptionNote("null", "folder of the scenes; null = DHTORCH_DATA, else dhtorch_data"),
+        "yes": OptionNote("false", "accept the printed licences"),
+        "table": OptionNote("null", "FILE.json: another table of addresses, as of a mirror"),
         "traceback": OptionNote("false", "show the traceback of an error"),
     },
     "report": {
@@ -450,7 +469,7 @@ def list_options(name: str, conf: Path) -> dict[str, OptionNote]:
         own |= {k: _SHARED_NOTES[k] for k in ("holdout.cutoff", "pairs.gap")}
     if name == "demo":
         return _DEMO_NOTES | {k: note for k, note in own.items() if k not in _DEMO_NOTES and k != "path"}
-    if name == "report":
+    if name in ("report", "fetch"):
         return own
     return {**{f"data.{option}": note for option, note in READER_NOTES.items()}, **own}
 

@@ -33,7 +33,11 @@ from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 
 #: Sub-command → module with ``main(argv) -> int``.
-_PARSED_COMMANDS = {"inspect": "dhtorch.cli.inspect", "report": "dhtorch.experiments.report"}
+_PARSED_COMMANDS = {
+    "inspect": "dhtorch.cli.inspect",
+    "report": "dhtorch.experiments.report",
+    "fetch": "dhtorch.cli.fetch",
+}
 
 #: Sub-command with its own settings ``conf/<name>.yaml`` → module with ``run(settings, parts, *, progress)`` -> exit
 #: code; ``settings`` are all options as plain values, ``parts`` the instantiated options that name a function.
