@@ -241,11 +241,33 @@ def by_scene(comparison: str) -> str:
     return table(heads, rows)
 
 
+def archived_answers() -> dict[str, dict[str, Any]]:
+    """Result files with a verdict: name → result."""
+    results = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
+    return {name: result for name, result in results.items() if isinstance(result, dict) and result.get("verdict")}
+
+
+def with_others(names: Sequence[str]) -> list[dict[str, Any]]:
+    """Results of some names, each followed by all others of its experiment: no answer is quoted without the others."""
+    answers = archived_answers()
+    wanted = [
+        other
+        for name in names
+        for other in (name, *(k for k in answers if answers[k]["experiment"] == answers[name]["experiment"]))
+    ]
+    return [answers[name] for name in dict.fromkeys(wanted)]
+
+
+def with_verdicts(make: Callable[[], str], *names: str) -> str:
+    """A table of bars, with the verdicts of its experiments on all data below it: met bars and missed ones."""
+    lines = [f"- {r['verdict']} on {r['data']['name']}: {r['why']}" for r in with_others(names)]
+    return "\n".join([make(), "", "Verdicts of this experiment, on every set of data that is archived:", "", *lines])
+
+
 def verdicts(names: Sequence[str]) -> str:
-    """Archived questions, their answers and why."""
+    """Archived questions, their answers and why, with those of the same experiment on other data."""
     rows = []
-    for name in names:
-        result = json.loads((RESULTS / f"{name}.json").read_text())
+    for result in with_others(names):
         n_scenes, n_pairs = len(result["data"]["scenes"]), result["data"].get("n_pairs") or 0
         count = f"{n_scenes} / {n_pairs}" if n_scenes > 1 else f"**1** / {n_pairs}"
         question = f"`{result['experiment']}` on {result['data']['name']}"
@@ -542,8 +564,7 @@ def aligned(*results: str) -> str:
 
 def questions() -> str:
     """Every archived answer, in alphabetical order."""
-    results = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
-    return verdicts([name for name, result in results.items() if isinstance(result, dict) and result.get("verdict")])
+    return verdicts(list(archived_answers()))
 
 
 def caught() -> str:
@@ -712,6 +733,19 @@ NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "ic
 TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
 TABLES |= {"untouched": untouched, "fidelity": fidelity.table, "fidelity commands": fidelity.commands}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
+
+
+#: Table of bars → results of its experiments.
+_VERDICTS_BELOW = {
+    "comparison": ("method_comparison",),
+    "every pixel": ("dense",),
+    "align": ("align_study",),
+    "validate": ("validate_study",),
+    "track chain": ("track_chain",),
+    "beside chosen": ("views_study",),
+    "shared": ("shared_scenes",),
+}
+TABLES |= {name: partial(with_verdicts, TABLES[name], *results) for name, results in _VERDICTS_BELOW.items()}
 
 
 def in_layout(name: str) -> str:

@@ -95,7 +95,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--traceback", action="store_true")
     options = parser.parse_args(argv)
     scenes = read_table(options.table or FETCHED_SETS[options.set])
-    out = options.out or Path(os.environ.get("DHTORCH_DATA") or "dhtorch_data")
+    out = (options.out or Path(os.environ.get("DHTORCH_DATA") or "dhtorch_data")).expanduser()
     for scene in scenes:
         digest = "" if not scene.archive or scene.archive_sha256 else "; digest of the archive unknown, files checked"
         print(f"{scene.folder}: {scene.licence}; {scene.source}{digest}")

@@ -182,8 +182,8 @@ def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: 
 
 def _scenes_key(settings: Mapping[str, Any], key: str) -> str:
     """Key of the scenes of a job: that of its result, and the machine and libraries on which their last bits depend."""
-    meta = _collect_metadata(settings)
-    return hashlib.sha256(repr((key, {k: v for k, v in meta.items() if k != "utc"})).encode()).hexdigest()
+    meta = {k: v for k, v in _collect_metadata(settings).items() if k not in ("utc", "git")}
+    return hashlib.sha256(repr((key, meta)).encode()).hexdigest()
 
 
 def _collect_metadata(settings: Mapping[str, Any]) -> dict[str, Any]:
