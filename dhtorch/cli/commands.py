@@ -370,6 +370,7 @@ COMMANDS: dict[str, Command] = {
         (
             ("shared_scenes", "print the licences, ask, download into DHTORCH_DATA"),
             ("shared_scenes --yes --out DIR", "accept them; another folder"),
+            ("shared_scenes --table FILE.json", "from the addresses of another table, as of a mirror"),
         ),
         ("out", "yes", "table", "traceback"),
     ),

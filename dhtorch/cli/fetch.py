@@ -59,7 +59,7 @@ class FetchedScene:
     texts: Mapping[str, str] = field(default_factory=dict)  # name → content of files that are ours
 
 
-def read_table(path: Path) -> list[FetchedScene]:
+def read_fetch_table(path: Path) -> list[FetchedScene]:
     """Scenes of a table.
 
     Raises:
@@ -94,7 +94,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--yes", action="store_true")
     parser.add_argument("--traceback", action="store_true")
     options = parser.parse_args(argv)
-    scenes = read_table(options.table or FETCHED_SETS[options.set])
+    scenes = read_fetch_table(options.table or FETCHED_SETS[options.set])
     out = (options.out or Path(os.environ.get("DHTORCH_DATA") or "dhtorch_data")).expanduser()
     for scene in scenes:
         digest = "" if not scene.archive or scene.archive_sha256 else "; digest of the archive unknown, files checked"
@@ -263,9 +263,9 @@ def _has_digest(path: Path, digest: str) -> bool:
     return path.is_file() and not path.is_symlink() and _file_sha256(path) == digest
 
 
-def _check_digest(found: str, expected: str, where: str) -> None:
-    if found != expected:
-        raise ValueError(f"{where}: found SHA-256 {found[:16]}…, expected {expected[:16]}…")
+def _check_digest(actual: str, expected: str, where: str) -> None:
+    if actual != expected:
+        raise ValueError(f"{where}: found SHA-256 {actual[:16]}…, expected {expected[:16]}…")
 
 
 def _sha256(content: bytes) -> str:

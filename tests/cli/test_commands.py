@@ -15,7 +15,7 @@ from dhtorch.runtime import console
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Commands that read a capture and compute maps from its frames.
-COMPUTING = [name for name in COMMANDS if name not in ("inspect", "report", "run")]
+COMPUTING = [name for name in COMMANDS if name not in ("inspect", "report", "fetch", "run")]
 
 
 def overrides(name, *argv):
@@ -37,7 +37,7 @@ def test_the_help_of_a_command_is_short(command, name):
     lines = out.splitlines()
     assert code == 0 and len(lines) <= 45 and max(map(len, lines)) < 120
     assert len(COMMANDS[name].examples) == 3
-    assert len(COMMANDS[name].options) <= 15 and (len(COMMANDS[name].options) >= 8 or name == "report")
+    assert len(COMMANDS[name].options) <= 15 and (len(COMMANDS[name].options) >= 8 or name in ("report", "fetch"))
     known = list_options(name, run.config_dir())
     for option in COMMANDS[name].options:
         note = known[resolve_option(name, option, known)]
@@ -96,7 +96,7 @@ def test_a_slip_has_one_line_with_the_nearest_name(command, tmp_path, argv, word
         assert word in line, line
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("inspect", "report")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("inspect", "report", "fetch")])
 def test_a_device_that_torch_cannot_use_is_one_line(command, monkeypatch, name):
     words = {
         "recover": ["recover", "."],

@@ -187,10 +187,10 @@ def test_names_and_links_that_lead_out_are_refused(server, tmp_path):
         file = tmp_path / "t.json"
         file.write_text(json.dumps({"scenes": [asdict(scene(server)) | bad]}))
         with pytest.raises(ValueError, match=r"t.json: .*expected (one inside the folder|an http or https address)"):
-            fetch.read_table(file)
+            fetch.read_fetch_table(file)
     (tmp_path / "t.json").write_text("[]")
     with pytest.raises(ValueError, match="found no table of scenes"):
-        fetch.read_table(tmp_path / "t.json")
+        fetch.read_fetch_table(tmp_path / "t.json")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "kitchen").symlink_to(tmp_path / "elsewhere")
@@ -223,7 +223,7 @@ def test_licences_come_first_and_nothing_is_fetched_without_consent(server, tmp_
 
 
 def test_the_table_names_every_shared_scene_with_its_licence():
-    scenes = {each.folder: each for each in fetch.read_table(fetch.FETCHED_SETS["shared_scenes"])}
+    scenes = {each.folder: each for each in fetch.read_fetch_table(fetch.FETCHED_SETS["shared_scenes"])}
     assert len(scenes) == 10 and all(each.licence and each.source.startswith("https://") for each in scenes.values())
     for each in scenes.values():
         assert all(len(digest) == 64 for digest in each.files.values()) and (each.base or each.archive)
@@ -232,7 +232,7 @@ def test_the_table_names_every_shared_scene_with_its_licence():
 
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 def test_the_digests_are_those_of_the_shared_scenes():
-    for each in fetch.read_table(fetch.FETCHED_SETS["shared_scenes"]):
+    for each in fetch.read_fetch_table(fetch.FETCHED_SETS["shared_scenes"]):
         folder = Path(ROOT, each.folder)
         there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
         assert there == {*each.files, *each.texts}, each.folder
