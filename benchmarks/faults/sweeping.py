@@ -122,7 +122,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_check_against_returns", "2 * wrong.sum((1, 2)) > n", "wrong.sum((1, 2)) > 2 * n"),
         (
             "_check_against_returns",
-            "swept_sigma.square() + (scale_error * swept.depth.detach()).square()",
+            "swept_sigma.square() + by_sensor",
             "swept_sigma.square()",
         ),
         ("merge_returns", "swept.keep & ~usable", "swept.keep & usable"),

@@ -21,7 +21,7 @@ from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.reliability import GOOD_ERROR_REL, pool_answers
 from dhtorch.metrics.risk import cap_error
-from dhtorch.records import DepthMap
+from dhtorch.records import DepthMap, SigmaBudget
 from dhtorch.runtime import storage
 
 _SCHEMA_VERSION = 1
@@ -57,6 +57,13 @@ class SigmaModel:
         """sqrt((scale · sigma)² + (floor · depth)²), in the unit of both."""
         return ((self.scale * sigma).square() + (self.floor * depth).square()).sqrt()
 
+    def corrected_parts(self, parts: SigmaBudget, stated: Tensor, corrected: Tensor) -> SigmaBudget:
+        """Variances by cause of a ``stated`` sigma -> those of the ``corrected``: a scale below one shrinks all terms,
+        what scale and floor add is in ``model``."""
+        parts = parts.map(lambda x: min(self.scale, 1.0) ** 2 * x)
+        added = corrected.square() - (min(self.scale, 1.0) * stated).square()
+        return parts.replace(model=parts.model + added.clamp_min(0))
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -72,7 +79,12 @@ class Calibration:
     def apply(self, scene: Answers) -> Answers:
         """The same answers, of a scene or of a depth map, with calibrated score and sigma."""
         score = torch.where(scene.keep, self.probability(scene.score), 0.0).to(scene.score)
-        return scene.replace(score=score, sigma=self.sigma(scene.sigma, scene.depth) if self.sigma else scene.sigma)
+        if self.sigma is None:
+            return scene.replace(score=score)
+        sigma = self.sigma(scene.sigma, scene.depth)
+        if isinstance(scene, DepthMap) and scene.parts is not None:
+            scene = scene.replace(parts=self.sigma.corrected_parts(scene.parts, scene.sigma, sigma))
+        return scene.replace(score=score, sigma=sigma)
 
     def min_score(self, percent: int) -> float | None:
         """The threshold for a mean error of ``percent``, on the calibrated score; None = answer nothing.

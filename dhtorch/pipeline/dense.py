@@ -34,7 +34,7 @@ from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
 from dhtorch.pipeline.planes import fill_planes
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples
+from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples, SigmaBudget
 
 #: Closed range of every keyword option of :func:`complete_depth` that is a number.
 DENSE_RANGES: Final[dict[str, tuple[float, float]]] = {
@@ -150,7 +150,9 @@ def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseO
     check_dense_options("sensor_depth_map", {"size": size})
     nan = torch.full((len(reference.camera.f), *map_hw(reference.hw, size)), torch.nan).to(reference.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
-    unanswered = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
+    zero = torch.zeros_like(nan)
+    parts = SigmaBudget.single("track", zero)
+    unanswered = DepthMap(nan, nan, zero, code, torch.full_like(code, Gate.NO_TRACK), parts)
     return merge_returns(unanswered, _returns(reference, method, map_hw(reference.hw, size)))
 
 
@@ -320,7 +322,15 @@ def _gated(
         score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0),
         source=keep.int() * Source.SWEPT,
         gate=gate,
+        parts=_swept_parts(fitted, depth.detach()),
     )
+
+
+def _swept_parts(fitted: surface.RefinedSurface, depth: Tensor) -> SigmaBudget:
+    """Variances (B, h, w) of swept depths by cause: grey values and edges, motions; the metric scale is added later."""
+    steep = depth.square().square()  # m⁴, of a variance of q to one of depth
+    zero = torch.zeros_like(depth[:1, :1, :1]).expand_as(depth)
+    return SigmaBudget(fitted.own * steep, fitted.shared * steep, zero, zero, zero)
 
 
 def _returns(reference: Frame, method: MethodSpec, hw: tuple[int, int]) -> SensorReturns:
@@ -348,8 +358,9 @@ def _check_against_returns(swept: DepthMap, returns: SensorReturns, near: Sample
     scale_error = masked_median(near.sigma / torch.where(has_sigma, near.depth, torch.ones_like(near.depth)), has_sigma)
     scale_error = torch.where(has_sigma.any(-1, keepdim=True), scale_error, 0.0)
     scale_error = scale_error[..., None].detach()  # a wrong scale affects all pixels alike
-    swept_sigma = (swept_sigma.square() + (scale_error * swept.depth.detach()).square()).sqrt()
-    return swept.replace(sigma=swept_sigma, gate=gate)
+    by_sensor = (scale_error * swept.depth.detach()).square()
+    parts = None if swept.parts is None else swept.parts.replace(reference=by_sensor)
+    return swept.replace(sigma=(swept_sigma.square() + by_sensor).sqrt(), gate=gate, parts=parts)
 
 
 def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
@@ -363,4 +374,5 @@ def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
         score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, swept.score, 0.0)),
         source=torch.where(keep, swept.source, Source.NONE).masked_fill(usable, Source.SENSOR),
         gate=swept.gate.masked_fill(usable, Gate.ANSWER),
+        parts=swept.parts,
     )

@@ -27,7 +27,7 @@ from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense import SelectedViews, Sweep, filter_sweep, gate_sweep, merge_returns, sweep_views
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.spec import MethodSpec
-from dhtorch.records import DepthMap, Estimate, Frame
+from dhtorch.records import DepthMap, Estimate, Frame, SigmaBudget
 from dhtorch.stages.fuse import fuse_consistent
 
 #: Joint answers of the views, also uncertain ones: an answer of the sweep may agree with them.
@@ -57,6 +57,7 @@ class _Answers(NamedTuple):
     shared: Tensor  # the pose's part of it
     expected: Tensor  # expected relative error, by which answers are ordered
     n_views: Tensor  # the reference view included
+    terms: Tensor  # (5, B, N) sigma / depth by cause, in the order of SigmaBudget
 
 
 class _Joint(NamedTuple):
@@ -144,9 +145,11 @@ def _with_shared_error(swept: DepthMap, sweep: Sweep, shared_q: Tensor, half_err
     """The swept map with sigma and score for a pose error of at least ``shared_q`` (B, 1) 1/m."""
     missing = (shared_q.to(swept.sigma)[..., None].square() - sweep.surface.shared).clamp_min(0)
     depth = swept.depth.detach()
-    sigma = (swept.sigma.square() + missing * depth.square().square()).sqrt()
+    added = missing * depth.square().square()
+    sigma = (swept.sigma.square() + added).sqrt()
     score = torch.where(swept.keep, half_error / (half_error + sigma / depth), 0.0)
-    return swept.replace(sigma=sigma, score=score)
+    parts = None if swept.parts is None else swept.parts.replace(pose=swept.parts.pose + added)
+    return swept.replace(sigma=sigma, score=score, parts=parts)
 
 
 def _fuse_views(selected: SelectedViews, fuse: Callable[..., Estimate]) -> Estimate:
@@ -165,7 +168,8 @@ def _sparse_answers(estimate: Estimate) -> _Answers:
     )
     sigma, shared = ((x / depth).detach() for x in (sigma, shared))
     n_views = estimate.n_views
-    return _Answers(keep, 1 / depth, sigma, shared, sigma / (n_views - 1).clamp_min(1).to(sigma).sqrt(), n_views)
+    expected = sigma / (n_views - 1).clamp_min(1).to(sigma).sqrt()
+    return _Answers(keep, 1 / depth, sigma, shared, expected, n_views, _terms(estimate.kept_parts, keep, depth))
 
 
 def _swept_answers(swept: DepthMap, sweep: Sweep, shared_q: Tensor, at: Tensor) -> _Answers:
@@ -177,7 +181,15 @@ def _swept_answers(swept: DepthMap, sweep: Sweep, shared_q: Tensor, at: Tensor) 
     depth, sigma = torch.where(keep, depth, 1.0), torch.where(keep, sigma, 1.0)
     sigma = (sigma / depth).detach()
     shared = torch.minimum(torch.maximum(pose_var.sqrt(), shared_q.to(sigma)) * depth.detach(), sigma)
-    return _Answers(keep, 1 / depth, sigma, shared, sigma, sweep.n_views[:, None].expand_as(keep))
+    n_views = sweep.n_views[:, None].expand_as(keep)
+    parts = swept.replace(sigma=swept.sigma.detach()).budget.map(lambda x: sample_nearest(x, at)[0])
+    return _Answers(keep, 1 / depth, sigma, shared, sigma, n_views, _terms(parts, keep, depth))
+
+
+def _terms(parts: SigmaBudget, keep: Tensor, depth: Tensor) -> Tensor:
+    """sigma / depth (5, B, N) by cause; 0 where there is no answer."""
+    variances = torch.stack([x.detach() for x in parts.values()])
+    return torch.where(keep & (variances > 0) & variances.isfinite(), variances, 0.0).sqrt() / depth.detach()
 
 
 def _join(
@@ -224,6 +236,11 @@ def _joint_estimate(selected: SelectedViews, joint: _Joint, half_error: float) -
     def choose(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(answered, new.to(old), old)
 
+    *known, model = ((w * one.terms + (1 - w) * other.terms) * depth.detach()).square()
+    model = torch.maximum(model, sigma.square() - sum(known))  # what the join adds
+    pairs = zip((*known, model), sparse.kept_parts.values(), strict=True)
+    parts = SigmaBudget(*(choose(new, old) for new, old in pairs))
+
     return sparse.replace(
         depth=choose(depth, sparse.depth),
         sigma=choose(sigma, sparse.sigma),
@@ -231,6 +248,7 @@ def _joint_estimate(selected: SelectedViews, joint: _Joint, half_error: float) -
         n_views=choose(n_views, sparse.n_views),
         score=choose(half_error / (half_error + joint.expected), sparse.score),
         gate=torch.where(answered, Gate.ANSWER, unanswered).to(sparse.gate),
+        parts=parts,
     )
 
 
@@ -255,10 +273,15 @@ def _insert(swept: DepthMap, at: Tensor, estimate: Estimate, selected: SelectedV
         return padded.scatter(1, target, new.to(values))[:, :-1].unflatten(1, (h, w))
 
     source = torch.where(joint.weight > 0.5, Source.RECOVERED, Source.SWEPT)
+    parts = None
+    if swept.parts is not None:
+        pairs = zip(swept.parts.values(), estimate.kept_parts.values(), strict=True)
+        parts = SigmaBudget(*(write(values, new) for values, new in pairs))
     return DepthMap(
         depth=write(swept.depth, estimate.depth),
         sigma=write(swept.sigma, estimate.sigma),
         score=write(swept.score, estimate.score),
         source=write(swept.source, source),
         gate=write(swept.gate, torch.full_like(estimate.gate, Gate.ANSWER)),
+        parts=parts,
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.checks import check
-from dhtorch.records import Estimate
+from dhtorch.records import Estimate, SigmaBudget
 
 #: Limits the own part of a variance from below: a fraction of the whole, without unit, whatever the pose's part.
 #: Source: origin not recorded.
@@ -82,6 +82,7 @@ def inverse_variance(
         sigma=sigma,
         sigma_shared=depth * depth * _root(shared_2),
         parallax_deg=estimates.parallax_deg.amax(0),
+        correlation=correlation,
     )
 
 
@@ -223,6 +224,7 @@ def _joint_estimate(
     sigma: Tensor,
     sigma_shared: Tensor,
     parallax_deg: Tensor,
+    correlation: float = 1.0,
 ) -> Estimate:
     """The joint estimate under the gates; its residual is the weighted rms of the views, of no view the last one's."""
     dtype = estimates.depth.dtype
@@ -244,7 +246,26 @@ def _joint_estimate(
         n_views=(n + 1).to(torch.int32),
         score=keep.to(dtype),
         gate=gate,
+        parts=_joint_parts(estimates, used, weight, depth, sigma, correlation).to(dtype),
     )
+
+
+def _joint_parts(
+    estimates: Estimate, used: Tensor, weight: Tensor, depth: Tensor, sigma: Tensor, correlation: float
+) -> SigmaBudget:
+    """Variances (B, N) of the joint depth by cause: each term joined as the whole, what joining adds in ``model``."""
+    parts = estimates.kept_parts
+    square = torch.where(used, estimates.depth.double(), 1.0).square()
+
+    def deviations(x: Tensor) -> Tensor:
+        """Weighted standard deviations (V, B, N) of the joint depth by one term of the views."""
+        return weight * _root(torch.where(used, x.double(), 0.0)) / square * depth.square()
+
+    track, *common = (deviations(x) for x in parts.values())
+    own = correlation * track.sum(0).square() + (1 - correlation) * track.square().sum(0)
+    pose, reference, lens, model = (x.sum(0).square() for x in common)
+    widening = (sigma.square() - own - pose - reference - lens).clamp_min(0)
+    return SigmaBudget(own, pose, reference, lens, torch.maximum(model, widening))
 
 
 def _inverse_depth(estimates: Estimate, answered: Tensor) -> tuple[Tensor, Tensor, Tensor]:

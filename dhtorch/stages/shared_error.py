@@ -114,7 +114,12 @@ def _widen(estimates: Estimate, relative: Tensor) -> Estimate:
     def widened(sigma: Tensor) -> Tensor:
         return torch.where(keep, (torch.where(keep, sigma, 1.0).square() + added).sqrt(), sigma)
 
-    return estimates.replace(sigma=widened(estimates.sigma), sigma_shared=widened(estimates.sigma_shared))
+    parts = estimates.kept_parts
+    return estimates.replace(
+        sigma=widened(estimates.sigma),
+        sigma_shared=widened(estimates.sigma_shared),
+        parts=parts.replace(lens=parts.lens + added),
+    )
 
 
 def _withhold(estimates: Estimate, rejected: Tensor, gate: int) -> Estimate:

@@ -16,7 +16,7 @@ from dhtorch.geometry.covariance import masked_median, noise_shape
 from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
 from dhtorch.geometry.se3 import Pose
-from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, Estimate, PoseFit, Samples, SigmaBudget, Tracks
 
 #: Limits the trackability (grey values in [0, 1]) that a grey difference is divided by from below: no division by 0.
 #: Source: origin not recorded.
@@ -127,8 +127,11 @@ def two_view(
     own = own * _variance_factor(
         (mismatch, mismatch_px), (geometry.residual_px, residual_px), (round_trip, round_trip_px)
     )
+    no_share = torch.zeros_like(shared)
+    by_pose, by_sensor = shared, no_share
     if sensor_share > 0:
-        shared = shared + (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
+        by_sensor = (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
+        shared = by_pose + by_sensor
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
     limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
@@ -165,6 +168,7 @@ def two_view(
         n_views=torch.where(measured, 2, 1).to(torch.int32),
         score=keep.to(geometry.depth.dtype),
         gate=gate,
+        parts=SigmaBudget(own, by_pose, by_sensor, lens=no_share, model=no_share),
     )
 
 

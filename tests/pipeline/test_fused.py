@@ -22,7 +22,13 @@ def answers(depth: float, sigma_rel: float, *, keep: bool = True, n_views: int =
     """One answer of one sample."""
     q, sigma = (torch.tensor([[x]], dtype=torch.float64) for x in (1 / depth, sigma_rel))
     return fused._Answers(
-        torch.tensor([[keep]]), q, sigma, 0.5 * sigma, sigma / (n_views - 1) ** 0.5, torch.tensor([[n_views]])
+        torch.tensor([[keep]]),
+        q,
+        sigma,
+        0.5 * sigma,
+        sigma / (n_views - 1) ** 0.5,
+        torch.tensor([[n_views]]),
+        sigma.expand(5, 1, 1) / 5**0.5,
     )
 
 
@@ -150,7 +156,7 @@ def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
         uv=at, depth=torch.tensor([[2.0, 3.0, 4.0]]), sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
         residual_px=one, n_views=2 * one.int(), score=torch.tensor([[0.3, 0.9, 0.6]]), gate=0 * one.int(),
     )  # fmt: skip
-    answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int())
+    answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int(), one[None])
     joint = fused._Joint(one.bool(), one, one, answer, answer)
 
     class Selected:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, first_reason
 from dhtorch.geometry.camera import to_matrix
-from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, Estimate, PoseFit, Samples, SigmaBudget, Tracks
 
 
 def two_view_kornia(
@@ -82,6 +82,7 @@ def two_view_kornia(
         n_views=torch.where(usable, 2, 1).int(),
         score=keep.double(),
         gate=gate,
+        parts=SigmaBudget(own, shared, *[torch.zeros_like(own)] * 3),
     ).to(samples.uv.dtype)
 
 

@@ -1,0 +1,156 @@
+"""The budget of sigma by cause and its intervals: sums, single causes, gradients, on the rules and on the room."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dhtorch.calibration.score_calibration import SigmaModel
+from dhtorch.codes import Source
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.completion import complete_depth, default_calibration
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.pytree import collate, stack
+from dhtorch.records import SigmaBudget, depth_interval
+from dhtorch.stages.fuse import fuse_consistent, inverse_variance
+from dhtorch.stages.shared_error import _widen
+from dhtorch.synthetic import SyntheticRoom
+
+NEAR = 2.0
+
+
+@pytest.fixture(scope="module")
+def views():
+    room = SyntheticRoom(
+        n_frames=12, hw=(120, 160), depth_hw=(120, 160), seed=3, lidar="exact", image_noise=0.0, supersample=1
+    )
+    return range_split(room[3], NEAR), stack([range_split(room[k], NEAR) for k in (0, 6, 9, 11)])
+
+
+@pytest.fixture(scope="module")
+def answers(views):
+    """Estimates by method name, and the calibrated map of the last."""
+    found = {}
+    with torch.no_grad():
+        for name in ("paper", "kornia", "map", "window", "auto", "fused"):
+            method = METHODS[name].replace(n=512, **({"complete": {"planes": 48}} if name == "fused" else {}))
+            found[name] = method(views[0], views[1] if method.views > 1 else views[1][3])
+        found["plain"] = complete_depth(*views, method=method, planes=48)
+        found["calibrated"] = complete_depth(*views, method=method, planes=48, calibration=default_calibration())
+    return found
+
+
+def total(budget: SigmaBudget) -> torch.Tensor:
+    return sum(budget.values())
+
+
+@pytest.mark.parametrize("name", ["paper", "kornia", "map", "window", "auto", "fused", "plain", "calibrated"])
+def test_the_terms_sum_to_the_square_of_sigma_and_are_empty_where_unanswered(answers, name):
+    answer = answers[name]
+    budget, keep = answer.budget, answer.keep
+    assert int(keep.sum()) > 300
+    torch.testing.assert_close(total(budget)[keep], answer.sigma.square()[keep], rtol=2e-6, atol=0.0)
+    assert all(bool((x[keep] >= 0).all()) and bool(x[~keep].isnan().all()) for x in budget.values())
+    assert bool((budget.dominating[~keep] == -1).all()) and bool((budget.dominating[keep] >= 0).all())
+
+
+@pytest.mark.parametrize("name", ["paper", "kornia", "map", "window", "auto", "fused", "plain", "calibrated"])
+def test_the_stored_parts_are_the_variance_and_need_no_scaling(answers, name):
+    answer = answers[name]
+    matched = answer.keep
+    if name in ("plain", "calibrated"):
+        matched = matched & ((answer.source == Source.RECOVERED) | (answer.source == Source.SWEPT))
+    torch.testing.assert_close(total(answer.parts)[matched], answer.sigma.square()[matched], rtol=5e-6, atol=0.0)
+
+
+def test_the_shared_part_is_all_but_track_and_model(answers):
+    for name in ("paper", "map"):
+        answer = answers[name]
+        budget, keep = answer.budget, answer.keep
+        shared = (budget.pose + budget.reference + budget.lens)[keep]
+        torch.testing.assert_close(shared, answer.sigma_shared.square()[keep], rtol=1e-5, atol=1e-12)
+        assert bool((budget.reference[keep] > 0).all()) == (name == "map")
+        assert not bool(budget.lens[keep].any()) and not bool(budget.model[keep].any())
+    assert bool((answers["auto"].budget.lens[answers["auto"].keep] > 0).all())
+
+
+def test_a_return_is_all_reference_and_a_filled_pixel_all_model(answers):
+    depth_map = answers["plain"]
+    budget = depth_map.budget
+    for source, term in ((Source.SENSOR, budget.reference), (Source.FILLED, budget.model)):
+        at = depth_map.source == source
+        assert bool(at.any())
+        torch.testing.assert_close(term[at], depth_map.sigma.square()[at])
+    assert bool((depth_map.replace(parts=None).budget.model > 0)[depth_map.source == Source.SWEPT].all())
+
+
+def test_of_a_calibrated_map_the_model_has_what_the_calibration_adds(answers):
+    at = (answers["plain"].source == Source.SWEPT) & (answers["calibrated"].source == Source.SWEPT)
+    before, after = answers["plain"].budget.track[at], answers["calibrated"].budget.track[at]
+    scale = default_calibration().sigma.scale
+    torch.testing.assert_close(after, min(scale, 1.0) ** 2 * before, rtol=1e-4, atol=0.0)
+    model, sigma = SigmaModel(2.0, 0.01), torch.tensor([0.1])
+    wide = model(sigma, torch.tensor([3.0]))
+    parts = model.corrected_parts(SigmaBudget.single("pose", sigma.square()), sigma, wide)
+    assert float(parts.pose) == pytest.approx(0.01) and float(parts.model) == pytest.approx(0.03 + 0.03**2)
+
+
+def _views_of(answer, chi: float):
+    """Two views' answers that differ by ``chi`` of their common standard deviations in inverse depth."""
+    one = answer.replace(depth=torch.full_like(answer.depth, 2.0), gate=torch.zeros_like(answer.gate))
+    parts = SigmaBudget(*(torch.full_like(answer.depth, v * 1e-4) for v in (4.0, 3.0, 2.0, 1.0, 0.0)))
+    sigma = one.depth * 0 + 1e-3**0.5
+    one = one.replace(parts=parts, sigma=sigma, sigma_shared=one.depth * 0 + 6e-4**0.5)
+    q = 0.5 + chi * 2**0.5 * float(sigma[0, 0]) / 4
+    other = one.replace(depth=torch.full_like(one.depth, 1 / q))
+    return stack([one, other])
+
+
+def test_joined_views_keep_the_proportions_and_their_disagreement_is_model(answers):
+    for fuse in (fuse_consistent, inverse_variance):
+        same = fuse(_views_of(answers["map"], 0.0))
+        shares = torch.stack([x / same.sigma.square() for x in same.budget.values()])[:, 0, 0]
+        torch.testing.assert_close(shares, torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0]), atol=1e-5, rtol=0.0)
+        apart = fuse(_views_of(answers["map"], 2.0))
+        model = (apart.budget.model / apart.sigma.square())[0, 0]
+        chi2 = 1 / (1 - float(model))
+        assert 2.5 < chi2 < 5.0, "the square of two standard deviations, each from the mean of both"
+    independent = inverse_variance(_views_of(answers["map"], 0.0), correlation=0.0)
+    torch.testing.assert_close(total(independent.parts), independent.sigma.square(), rtol=1e-5, atol=0.0)
+    assert float((independent.budget.track / independent.sigma.square())[0, 0]) == pytest.approx(0.25, abs=1e-3)
+
+
+def test_an_error_of_direction_is_lens(answers):
+    answer = answers["map"]
+    wide = _widen(answer, torch.full_like(answer.depth, 0.02))
+    keep = answer.keep
+    torch.testing.assert_close(wide.budget.lens[keep], (0.02 * answer.depth[keep]).square())
+    torch.testing.assert_close(wide.budget.track[keep], answer.budget.track[keep], rtol=1e-4, atol=1e-10)
+
+
+def test_the_interval_is_symmetric_in_inverse_depth():
+    depth, sigma = torch.tensor([4.0, 4.0, 4.0, torch.nan]), torch.tensor([0.4, 2.0, 3.0, torch.nan])
+    low, high = depth_interval(depth, sigma, 2.0)
+    torch.testing.assert_close(1 / low[:1] - 1 / depth[:1], 1 / depth[:1] - 1 / high[:1])
+    assert float(1 / low[0] - 0.25) == pytest.approx(2 * 0.4 / 16)
+    assert high[1].isinf() and high[2].isinf() and low[3].isnan() and high[3].isnan()
+    one, _ = depth_interval(depth, sigma, 1.0)
+    assert bool((one[:3] > low[:3]).all())
+
+
+def test_the_budget_is_batched_indexed_and_differentiable(views):
+    method = METHODS["map"].replace(n=256)
+    image = (views[1].image[3] / 255).requires_grad_()
+    estimate = method(views[0], views[1][3].replace(image=image))
+    budget, keep = estimate.budget, estimate.keep
+    for term in (budget.track, budget.pose):
+        (gradient,) = torch.autograd.grad(term[keep].sum(), image, retain_graph=True)
+        assert bool(gradient.isfinite().all()) and bool(gradient.any())
+    low, high = estimate.interval()
+    (gradient,) = torch.autograd.grad((high - low)[keep & high.isfinite()].sum(), image)
+    assert bool(gradient.isfinite().all()) and bool(gradient.any())
+    other = views[1][3].replace(image=image.detach())
+    both = method(collate([views[0], views[0]]), collate([other, other]))
+    for k in (0, 1):
+        for term, alone in zip(both[k : k + 1].budget.values(), budget.values(), strict=True):
+            torch.testing.assert_close(term, alone, equal_nan=True, rtol=1e-4, atol=1e-9)
