@@ -20,6 +20,7 @@ from dhtorch.calibration.score_calibration import fit_calibration
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.metrics.errors import Points
+from dhtorch.metrics.uncertainty import measure_uncertainty
 
 #: Fewest answers of either method for a scene to have a ratio.
 MIN_COMPARED_ANSWERS = 20
@@ -32,6 +33,9 @@ _TARGET_PERCENT = (10, 5)
 
 #: Errors are raised to this relative error before a division: below it they are rounding.
 MIN_COMPARED_ERROR = 1e-6
+
+#: Numbers of :func:`dhtorch.metrics.uncertainty.measure_uncertainty` that a comparison adds to its own.
+_UNCERTAINTY_NUMBERS = ("interval_1", "interval_2", "ause", "worst_bias")
 
 #: Scene → the candidates of every seed.
 SeedPoints = Mapping[str, Sequence[Points]]
@@ -72,15 +76,17 @@ def method_ratios(
     Returns:
         Comparison. For every other method, geometric means over scenes: ``median_rel_ratio`` (each method on its own
         answers), ``median_rel_ratio_at_equal_coverage`` (both cut by their own score to the smaller number of answers,
-        seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``coverage_at_5``:
-        mean over scenes (on many it is zero, so that their median jumps). In held-out rooms, means over scenes:
-        ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``, mean capped
-        error at the threshold that nine in ten of the other scenes keep, where a scene without an answer above it
-        counts 0 (``risk_of_speaking_<per cent>``: without those scenes); ``coverage_within_<per cent>``, coverage above
-        the threshold; ``within_target_<per cent>``, fraction of scenes that meet the target among those with a hundred
-        answers above the threshold; ``ece_scenes``, :func:`dhtorch.metrics.reliability.excess_ece` scene by scene. And
-        over all answers, every scene of the same weight: ``ece`` of the calibrated table, ``ece_sigmoid`` of the
-        sigmoid control, ``ece_raw`` of the uncalibrated score.
+        seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``interval_1``,
+        ``interval_2``, ``ause``, ``worst_bias``: of the method's own sigma, means over scenes
+        (:func:`dhtorch.metrics.uncertainty.measure_uncertainty`). ``coverage_at_5``: mean over scenes (on many it is
+        zero, so that their median jumps). In held-out rooms, means over scenes: ``within_sigma`` and ``within_2sigma``
+        after the correction of sigma; ``realised_risk_<per cent>``, mean capped error at the threshold that nine in ten
+        of the other scenes keep, where a scene without an answer above it counts 0 (``risk_of_speaking_<per cent>``:
+        without those scenes); ``coverage_within_<per cent>``, coverage above the threshold; ``within_target_<per
+        cent>``, fraction of scenes that meet the target among those with a hundred answers above the threshold;
+        ``ece_scenes``, :func:`dhtorch.metrics.reliability.excess_ece` scene by scene. And over all answers, every scene
+        of the same weight: ``ece`` of the calibrated table, ``ece_sigmoid`` of the sigmoid control, ``ece_raw`` of the
+        uncalibrated score.
 
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
@@ -93,6 +99,7 @@ def method_ratios(
         rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
         numbers = _ratios(ours, complete[reference], rows, comparison.left_out.setdefault(method, []), draws, seed)
         numbers |= evaluate_promises(ours, rooms, rows, draws, seed)
+        numbers |= _stated_uncertainty(ours, rows, draws, seed)
         for percent in _TARGET_PERCENT:
             key = f"realised_risk_{percent}"
             comparison.unanswered[f"{method}.{percent}"] = [
@@ -207,6 +214,21 @@ def _ratios(
         "worst_scene_ratio": _worst_ratio(equal),
         "aurc_ratio": geometric(ranked, "aurc_ratio"),
         "coverage_at_5": bootstrap.interval_over_scenes(coverages, statistic="mean", draws=draws, seed=seed),
+    }
+
+
+def _stated_uncertainty(
+    ours: SeedPoints, rows: dict[str, dict[str, Any]], draws: int, seed: int
+) -> dict[str, Interval]:
+    """Coverage of the intervals of the method's own sigma, AUSE and bias by range, means over scenes; seeds pooled."""
+    for scene, points in ours.items():
+        numbers = measure_uncertainty(pytree.collate(points))
+        rows[scene] |= {k: numbers[k] for k in _UNCERTAINTY_NUMBERS}
+    return {
+        name: bootstrap.interval_over_scenes(
+            [row[name] for row in rows.values()], statistic="mean", draws=draws, seed=seed
+        )
+        for name in _UNCERTAINTY_NUMBERS
     }
 
 

@@ -20,7 +20,17 @@ from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import xfeat
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.compare import uncertainty_study
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_columns,
+)
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.errors import Points
@@ -65,6 +75,7 @@ def run(
     baselines: Sequence[str] = ("auto_2",),
     indoor: Sequence[str] = (),
     moving: Sequence[str] = (),
+    disjoint: Sequence[str] = (),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Errors and coverages of several methods on the same pairs, several seeds each, relative to a reference.
@@ -88,6 +99,9 @@ def run(
         indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
         moving: rooms in which near objects move; their scenes, whatever their role, make ``<method>.convoy_wrong``,
             the largest fraction over scenes of candidates (all seeds) that are answered with an error above 20 %.
+        disjoint: compared methods that select views; they answer twice more, from disjoint halves of the candidates,
+            for ``<method>.chi2`` and ``.chi2_median`` (:func:`dhtorch.metrics.uncertainty.disjoint_agreement`), means
+            over scenes.
 
     Scenes with the role ``rotation`` make ``<method>.rotation_answered``
     (:func:`dhtorch.experiments.compare_methods.rotation_answered`).
@@ -106,7 +120,15 @@ def run(
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
-    outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    for name in disjoint:
+        variants |= uncertainty_study.disjoint_variants(name, methods[name])
+    run_protocol = Protocol(
+        variants, columns=uncertainty_study.UncertaintyColumns(disjoint) if disjoint else no_columns
+    )
+    outcome = protocol.run(scenes, run_protocol, pairs, settings, progress=progress)
+    uncertainty_study.join_halves(outcome, disjoint)
+    for name in disjoint:
+        outcome.summary |= uncertainty_study.summarise_agreement(name, list(outcome.scenes(name).values()))
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
     with_role = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
     all_points = {name: points_by_seed(outcome, name, seeds) for name in (reference, *compared)}

@@ -78,6 +78,16 @@ _METRIC_HEADINGS = {
     "vs_context": "ratio to context",
     "vs_dinov2": "ratio to DINOv2",
     "vs_xfeat": "ratio to XFeat",
+    "ause": "AUSE",
+    "interval_1": "inside k = 1",
+    "interval_2": "inside k = 2",
+    "calibrated_2": "inside k = 2, calibrated",
+    "scenes_within": "scenes with 95 ± 3 %",
+    "worst_bias": "largest bias of a range",
+    "room_bias": "largest bias, rooms",
+    "bias_over_floor": "largest bias over floor",
+    "chi2": "χ² of disjoint views",
+    "chi2_median": "χ², from the median",
 }
 #: Metric → style, where the rules of :func:`metric_style` do not apply.
 _METRIC_STYLES = {
@@ -89,6 +99,9 @@ _METRIC_STYLES = {
 }
 _METRIC_STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
 _METRIC_STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
+_METRIC_STYLES |= dict.fromkeys(("interval_1", "interval_2", "calibrated_2", "scenes_within", "floor"), "percent")
+_METRIC_STYLES |= {"worst_bias": "percent", "room_bias": "percent", "ause": "fine", "bias_over_floor": "ratio"}
+_METRIC_STYLES |= {"chi2": "ratio", "chi2_median": "ratio"}
 _METRIC_STYLES |= dict.fromkeys(("mse", "vs_context", "vs_dinov2", "vs_xfeat"), "fine")
 _METRIC_STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
 _METRIC_STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}

@@ -31,6 +31,11 @@ from dhtorch.experiments.report.tables import (
 from dhtorch.metrics.risk import find_knee
 
 #: What the method of the paper is here, and why some of its cells are blank.
+#: Numbers of a stated sigma, see dhtorch.metrics.uncertainty.
+_UNCERTAINTY_COLUMNS = ("interval_1", "interval_2", "worst_bias", "ause", "chi2")
+#: Causes of sigma, see dhtorch.records.SigmaBudget.
+_TERMS = ("track", "pose", "reference", "lens", "model")
+
 _COMPARISON_NOTE = (
     "paper: what its text leaves open (samples, window, levels, hypotheses, minimal solver, score formula) was chosen "
     "here, see docs/methods.md; opencv: the same stages of OpenCV. Cells of a sigma or a probability are blank for "
@@ -255,7 +260,7 @@ def _ablation(result: Result) -> list[ReportTable]:
 def _comparison(result: Result) -> list[ReportTable]:
     """Table of the method comparison, with ratios to the reference method."""
     columns = ["coverage", "median_rel", "median_rel_ratio", "worst_scene_ratio", "aurc", "aurc_ratio", "coverage_at_5"]
-    columns += ["within_sigma", "within_2sigma", "ece", "realised_risk_5", "realised_risk_10"]
+    columns += ["within_sigma", "within_2sigma", *_UNCERTAINTY_COLUMNS, "ece", "realised_risk_5", "realised_risk_10"]
     measured = [m for m in columns if any(summary_entry(result, v, m) for v in variant_names(result))]
     table = variant_table(result, "Methods, over scenes", ["n_scenes", *measured])
     return [replace(table, note=_COMPARISON_NOTE)]
@@ -276,6 +281,16 @@ def _views_study(result: Result) -> list[ReportTable]:
     return [
         variant_table(result, "Chosen views and fixed gaps, over scenes", ("n_scenes", "coverage", "coverage_at_5")),
         scene_table(auto_rows, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
+    ]
+
+
+def _uncertainty(result: Result) -> list[ReportTable]:
+    """Tables of the study of stated uncertainty: over scenes, and by scene."""
+    columns = ("n_scenes", *_UNCERTAINTY_COLUMNS[:2], "scenes_within", "room_bias", "bias_over_floor", "aurc", "ause")
+    by_scene = ("n_kept", *_UNCERTAINTY_COLUMNS, "calibrated_2", "floor", *(f"{term}_share" for term in _TERMS))
+    return [
+        variant_table(result, "Intervals and bias, over scenes", (*columns, "chi2", "chi2_median")),
+        scene_table(result, "Intervals, bias and the causes of sigma, by scene", by_scene),
     ]
 
 
@@ -324,6 +339,7 @@ EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "method_comparison": _comparison,
     "learned_score": _learned_score,
     "part_ablation": _part_ablation,
+    "uncertainty_study": _uncertainty,
     "views_study": _views_study,
     "dense_comparison": _dense,
     "helix_correlation": negatives.helix_tables,
