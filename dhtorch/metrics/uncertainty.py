@@ -47,13 +47,13 @@ def range_bias(points: Points, *, min_answers: int = MIN_BIN_ANSWERS) -> list[Ra
     answered = points.answered()
     signed = (answered.depth - answered.true_depth) / answered.true_depth
     index = (answered.true_depth.log() / math.log(RANGE_BIN_RATIO)).floor().long()
-    found = []
+    bins = []
     for k in index.unique().tolist():
         error = signed[index == k]
         if error.numel() >= min_answers:
             edges = RANGE_BIN_RATIO**k, RANGE_BIN_RATIO ** (k + 1)
-            found.append(RangeBias(*edges, error.numel(), float(error.median()), float(error.clamp(-1, 1).mean())))
-    return found
+            bins.append(RangeBias(*edges, error.numel(), float(error.median()), float(error.clamp(-1, 1).mean())))
+    return bins
 
 
 def interval_coverage(points: Points, k: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Coverage of intervals, bias by range and agreement of disjoint disjoint, on drawn answers whose errors are known."""
+"""Coverage of intervals, bias by range and agreement of disjoint views, on drawn answers whose errors are known."""
 
 import math
 
@@ -8,9 +8,9 @@ import torch
 from dhtorch.metrics.errors import make_points
 from dhtorch.metrics.uncertainty import (
     RANGE_BIN_RATIO,
+    disjoint_agreement,
     interval_coverage,
     measure_uncertainty,
-    disjoint_agreement,
     range_bias,
 )
 from dhtorch.records import Estimate, SigmaBudget
@@ -81,7 +81,7 @@ def estimate(seed, stated=1.0, common=0.0, n=4000):
     )
 
 
-def test_disjoint_partners_agree_by_what_they_do_not_share():
+def test_disjoint_views_agree_by_what_they_do_not_share():
     for common in (0.0, 0.1):
         right = disjoint_agreement(estimate(1, common=common), estimate(2, common=common))
         assert right.chi2 == pytest.approx(1, abs=0.08) and right.chi2_median == pytest.approx(1, abs=0.1)

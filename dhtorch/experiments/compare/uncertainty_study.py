@@ -19,7 +19,7 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
-from dhtorch.metrics.uncertainty import interval_coverage, measure_uncertainty, disjoint_agreement, range_bias
+from dhtorch.metrics.uncertainty import disjoint_agreement, interval_coverage, measure_uncertainty, range_bias
 from dhtorch.records import Estimate
 
 QUESTION = "Does the stated interval hold the truth, at every range and in every scene?"
