@@ -122,10 +122,8 @@ def run(
     }
     for name in disjoint:
         variants |= uncertainty_study.disjoint_variants(name, methods[name])
-    run_protocol = Protocol(
-        variants, columns=uncertainty_study.UncertaintyColumns(disjoint) if disjoint else no_columns
-    )
-    outcome = protocol.run(scenes, run_protocol, pairs, settings, progress=progress)
+    columns = uncertainty_study.UncertaintyColumns(disjoint) if disjoint else no_columns
+    outcome = protocol.run(scenes, Protocol(variants, columns=columns), pairs, settings, progress=progress)
     uncertainty_study.join_halves(outcome, disjoint)
     for name in disjoint:
         outcome.summary |= uncertainty_study.summarise_agreement(name, list(outcome.scenes(name).values()))
