@@ -49,6 +49,7 @@ EXPERIMENTS = {
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.reference_views=3",
+    "uncertainty_study": "experiment=uncertainty_study data=shared_scenes",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
     "field_study": "experiment=field_study",
     "validate_study": "experiment=validate_study data=shared_scenes",
