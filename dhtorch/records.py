@@ -221,6 +221,11 @@ class SigmaBudget(Record):
         """The five terms in their order."""
         return self.track, self.pose, self.reference, self.lens, self.model
 
+    @classmethod
+    def terms(cls) -> tuple[str, ...]:
+        """The names of the terms in their order."""
+        return "track", "pose", "reference", "lens", "model"
+
     @property
     def dominating(self) -> Tensor:
         """Index of the largest term, int64: 0 track, 1 pose, 2 reference, 3 lens, 4 model; -1 where unanswered."""

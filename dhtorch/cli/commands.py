@@ -155,6 +155,8 @@ COMMANDS: dict[str, Command] = {
             "format",
             "unit",
             "arrays",
+            "budget",
+            "sensor",
             "points",
             "figures",
             "fov",

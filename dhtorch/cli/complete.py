@@ -23,7 +23,7 @@ from dhtorch import export
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.completed_folder import EXTRA_FILES, CompletionTask, Row
 from dhtorch.cli.layouts import FRAME_LAYOUTS, has_varying_camera, select_layout, stray_confidence
-from dhtorch.codes import Gate, Source, names, words
+from dhtorch.codes import Gate, Source, is_estimated, names, words
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
@@ -32,10 +32,11 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import with_sensor
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import report_selection, with_view_selection
 from dhtorch.pytree import stack
-from dhtorch.records import DepthMap, Frame
+from dhtorch.records import DepthMap, Frame, SigmaBudget
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
@@ -48,6 +49,8 @@ _DEFAULT_CALIBRATION_NAME = "fused"
 
 #: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")
+#: Further ones, which enter it only where they are set.
+_SET_KEY_OPTIONS = ("budget", "sensor")
 
 #: Numeric option → (low, high): valid in low < value <= high.
 _OPTION_RANGES = {
@@ -129,13 +132,14 @@ def make_completion_task(
         raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
     is_same_size = dense.map_hw(hw, settings["size"]) == hw
     layout_options = {"unit": settings["unit"], "arrays": settings["arrays"], "same": is_same_size}
+    layout_options["budget"] = bool(settings.get("budget"))
     layout = select_layout(scene.recording, settings["format"], **layout_options)
     pairs = [] if len(scene.recording) < 2 else by_choice(scene, settings["steps"], stride=1, past=settings["past"])
     return CompletionTask(
         scene=scene,
         folder=folder,
         layout=layout,
-        method=method,
+        method=with_sensor(method, settings.get("sensor")),
         settings=settings,
         frames=frames,
         offers={pair.reference: pair.candidates for pair in pairs},
@@ -144,7 +148,7 @@ def make_completion_task(
             layout,
             settings,
             digest,
-            keyed=_KEY_OPTIONS,
+            keyed=(*_KEY_OPTIONS, *(name for name in _SET_KEY_OPTIONS if settings.get(name))),
             roots=_CODE_ROOTS,
             calibration=_DEFAULT_CALIBRATION_NAME,
         ),
@@ -243,6 +247,9 @@ def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: Dept
         pictures[layout.pictures] = resize_picture(reference, steps.depth.shape)
     if layout.confidence:
         pictures["confidence"] = stray_confidence(steps.source)
+    shares: Row = {}
+    if layout.budget:
+        pictures["budget"], shares["sigma_shares"] = _summarise_budget(depth_map)
     if not (shared_file := task.folder / "complete.json").is_file():
         storage.write_json(shared_file, task.shared)
     for kind, pixels in pictures.items():
@@ -250,7 +257,7 @@ def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: Dept
     if layout.arrays:
         storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(depth_map))
     row = storage.to_strict_json(
-        _describe_frame(task, i, reference, steps) | views_row | _count_pixels(steps, depth_map)
+        _describe_frame(task, i, reference, steps) | views_row | _count_pixels(steps, depth_map) | shares
     )
     storage.write_json(layout.file(task.folder, "meta", name), row)
     task.done[name] = row
@@ -283,6 +290,16 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
     no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
+
+
+def _summarise_budget(depth_map: DepthMap) -> tuple[np.ndarray, Row]:
+    """Map (h, w) -> the largest cause of sigma of every pixel as uint8 (0 no answer, 1 + the position in
+    :class:`dhtorch.records.SigmaBudget`), and the mean share of each cause in sigma² over the estimated pixels."""
+    budget, estimated = depth_map.budget, depth_map.keep & is_estimated(depth_map.source)
+    total = depth_map.sigma[estimated].square()
+    terms = {name: getattr(budget, name)[estimated] for name in SigmaBudget.terms()}
+    shares = {name: float((x / total).mean()) if len(total) else None for name, x in terms.items()}
+    return (budget.dominating + 1).to(torch.uint8).numpy(), shares
 
 
 def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:

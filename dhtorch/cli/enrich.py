@@ -31,6 +31,7 @@ from dhtorch.extract.step_set import RldsSource
 from dhtorch.extract.targets import DatasetTarget
 from dhtorch.ops import loader
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.presets import with_sensor
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
@@ -48,7 +49,7 @@ _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1
 
 #: Options that determine what is written; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma",
-         "columns", "max_frames", "every", "maps", "step", "fps", "task", "on_error")  # fmt: skip
+         "columns", "max_frames", "every", "maps", "step", "fps", "task", "on_error", "sensor")  # fmt: skip
 
 #: File of the shared metadata.
 _METADATA_FILE = "dhtorch.json"
@@ -164,7 +165,8 @@ def _write_missing_episodes(
 
 
 def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJob:
-    scenes, method = _subsample(scenes_of(parts["data"]), settings), parts["method"]
+    scenes = _subsample(scenes_of(parts["data"]), settings)
+    method = with_sensor(parts["method"], settings["sensor"])
     whole = plan.make_plan(scenes, settings["gap"], method.views, rigs=True)
     out = Path(str(settings["out"])).expanduser()
     for root in whole.roots:

@@ -36,6 +36,7 @@ from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
+from dhtorch.stages.sensor_noise import sensor_of_format
 from dhtorch.validation.capture_check import check_capture
 from dhtorch.viz.plots.canvas import format_capture_name
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
@@ -355,6 +356,8 @@ def print_survey(capture: FoundCapture, survey: Survey, console: Any = None) -> 
     table.add_column()
     table.add_row("path", escape_markup(str(capture.path)))
     table.add_row("format", escape_markup(f"{survey.format} ({capture.evidence})"))
+    if sensor := sensor_of_format(survey.format):
+        table.add_row("sensor", escape_markup(f"of this format, {sensor}; sensor={sensor} states its noise by range"))
     for what, text in survey.facts:
         table.add_row(escape_markup(what), escape_markup(text))
     for text in survey.warnings:

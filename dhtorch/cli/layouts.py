@@ -60,11 +60,12 @@ class Layout:
     stamped: bool = False  # named by time instead of number
     confidence: bool = False
     arrays: bool = False
+    budget: bool = False
 
     @property
     def folders(self) -> list[str]:
         """Folders of a frame's files in the order of writing."""
-        optional = {"confidence": self.confidence, "arrays": self.arrays}
+        optional = {"confidence": self.confidence, "arrays": self.arrays, "budget": self.budget}
         extra = [kind for kind, is_written in optional.items() if is_written]
         return ["depth", "sigma", "source", *([self.pictures] if self.pictures else []), *extra, "meta"]
 
@@ -119,7 +120,15 @@ FRAME_LAYOUTS = {
 _LAYOUT_OF_FORMAT = {"tum": "tum", "stray": "stray"}
 
 
-def select_layout(recording: Recording, wanted: str, unit: float | None, *, same: bool, arrays: bool = False) -> Layout:
+def select_layout(
+    recording: Recording,
+    wanted: str,
+    unit: float | None,
+    *,
+    same: bool,
+    arrays: bool = False,
+    budget: bool = False,
+) -> Layout:
     """The layout for the maps of a recording.
 
     Args:
@@ -128,6 +137,7 @@ def select_layout(recording: Recording, wanted: str, unit: float | None, *, same
         unit: m, a step of depth. None = the layout's own.
         same: whether the maps have the size of the images.
         arrays: whether NPZ files are written as well.
+        budget: whether maps of the largest cause of sigma are.
 
     Raises:
         ValueError: the layout cannot hold this recording, or its reader takes another unit.
@@ -141,7 +151,7 @@ def select_layout(recording: Recording, wanted: str, unit: float | None, *, same
         raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only unit of format=stray")
     if recording.sparse and layout.name in ("frames", "png"):
         layout = replace(layout, unit=_SPARSE_DEPTH_STEP_M)
-    return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays)
+    return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays, budget=budget)
 
 
 def stray_confidence(source: np.ndarray) -> np.ndarray:

@@ -74,7 +74,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "dtype": _one_of("float32", "float64"),
     "device": ((lambda v: isinstance(v, str)), "a device that torch can use on this machine, e.g. cpu or cuda"),
     "figures": _one_of(True, False, "all"),
-    **dict.fromkeys(("resume", "traceback", "arrays", "points", "past"), _TRUE_OR_FALSE),
+    **dict.fromkeys(("resume", "traceback", "arrays", "budget", "points", "past"), _TRUE_OR_FALSE),
     "cutoff": _or_null(_above_zero()),
     "holdout.cutoff": _or_null(_above_zero()),
     "holdout.truth": _one_of("raw", "5x5", "full"),

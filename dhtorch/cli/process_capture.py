@@ -61,6 +61,7 @@ _COMPLETE_DEFAULTS = {
     "format": "auto",
     "unit": None,
     "arrays": False,
+    "budget": False,
     "figures": False,
     "previews": "all",
     "points": False,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 from dhtorch.geometry.coarse_flow import coarse_flow
@@ -17,6 +18,7 @@ from dhtorch.stages.kornia.track import lucas_kanade_kornia
 from dhtorch.stages.kornia.triangulate import two_view_kornia
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
+from dhtorch.stages.sensor_noise import get_sensor_noise
 from dhtorch.stages.shared_error import verify_views
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.track_chain import track_chain
@@ -95,6 +97,17 @@ FUSED = AUTO.replace(complete=fuse_with_sweep)
 
 #: Methods by name.
 METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO, "fused": FUSED}
+
+
+def with_sensor(method: Method, sensor: str | Sequence[float] | None) -> Method:
+    """The method with the noise of a class of sensors, or of three numbers; None = as it is.
+
+    Raises:
+        ValueError: as :func:`dhtorch.stages.sensor_noise.get_sensor_noise`.
+    """
+    if sensor is None:
+        return method
+    return method.replace(backproject={"sensor": tuple(get_sensor_noise(sensor))})
 
 
 def get_method(method: str | Method, n: int | None = None) -> Method:

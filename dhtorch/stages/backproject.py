@@ -5,7 +5,7 @@ A sample without a usable return is NaN and flagged, never filled from its neigh
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from dhtorch.geometry.patches import (
 from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
 from dhtorch.ops.dispatch import operator
 from dhtorch.records import Camera, Frame, Samples
+from dhtorch.stages.sensor_noise import get_sensor_noise
 
 #: Limits the search for a return in a sparse depth map: Chebyshev radius in depth pixels.
 #: Source: derived, (7 − 1) / 2 of the 7×7 windows in which ``metrics.holdout`` reads sparse returns.
@@ -62,6 +63,7 @@ def backproject(
     dark: float = 0.05,
     saturated: float = 0.99,
     highlight: float = 0.85,
+    sensor: str | Sequence[float] | None = None,
 ) -> Samples:
     """Samples of a frame at pixels uv: depth, sigma, camera-frame points, confidence and flags.
 
@@ -80,6 +82,8 @@ def backproject(
             farther) above which DEPTH_EDGE is set.
         dark, saturated: mean grey of the neighbourhood below / above which UNDEREXPOSED / SATURATED is set.
         highlight: a colourless pixel above it that is brighter than its neighbourhood is SPECULAR.
+        sensor: class of the sensor, whose noise by range replaces ``sigma_m`` and ``sigma_rel``, or three numbers
+            (:data:`dhtorch.stages.sensor_noise.SENSORS`); None = not stated.
 
     Returns:
         Samples with ``trackability`` 0 and ``hole`` NONE: the next stage fills them. ``confidence`` is the sensor's
@@ -112,7 +116,7 @@ def backproject(
         highlight=highlight,
     )
     camera, own = frame.camera, frame.depth_camera
-    return _read_samples(
+    samples = _read_samples(
         frame.image,
         frame.depth,
         frame.conf,
@@ -123,6 +127,7 @@ def backproject(
         search_px=search_px,
         limits=limits,
     )
+    return samples if sensor is None else samples.replace(sigma=get_sensor_noise(sensor)(samples.depth))
 
 
 class ReturnLimits(NamedTuple):

@@ -1,0 +1,73 @@
+"""Noise of sensor classes: published values, what stating a class changes, and what is refused."""
+
+import pytest
+import torch
+
+from dhtorch.data import FORMATS
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.sensor_noise import SENSORS, get_sensor_noise, sensor_of_format
+from dhtorch.synthetic import SyntheticRoom
+
+
+@pytest.fixture(scope="module")
+def frames():
+    room = SyntheticRoom(n_frames=8, hw=(120, 160), depth_hw=(120, 160), seed=3, lidar="exact", supersample=1)
+    return [range_split(room[k], 2.0) for k in (1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("name", "z", "sigma"),
+    [
+        ("kinect_v1", 0.4, 0.0012),
+        ("kinect_v1", 5.0, 0.0012 + 0.0019 * 4.6**2),
+        ("kinect_v2", 0.5, 0.0015),
+        ("kinect_v2", 4.5, 0.0215),
+        ("azure_kinect", 1.0, 0.0183),
+        ("azure_kinect", 4.0, 0.0190),
+        ("hololens", 2.0, 0.0186),
+        ("realsense_d4xx", 2.0, 0.0151),
+        ("iphone_lidar", 3.0, 0.01),
+    ],
+)
+def test_noise_is_that_of_the_source(name, z, sigma):
+    assert float(get_sensor_noise(name)(torch.tensor(z, dtype=torch.float64))) == pytest.approx(sigma, rel=0.01)
+
+
+def test_a_stated_class_changes_sigma_alone_and_only_where_there_is_a_return(frames):
+    uv = torch.rand(256, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([159.0, 119.0])
+    plain, stated, own = (backproject(frames[0], uv, sensor=s) for s in (None, "kinect_v1", (0.01, 0.0, 0.0)))
+    returned = plain.depth > 0
+    torch.testing.assert_close(plain.sigma, 0.01 * plain.depth, rtol=0, atol=0)
+    torch.testing.assert_close(stated.sigma[returned], get_sensor_noise("kinect_v1")(plain.depth[returned]))
+    assert (
+        bool((own.sigma[returned] == 0.01).all()) and bool((own.sigma[~returned] == 0).all()) and bool(returned.any())
+    )
+    for name in ("depth", "confidence", "flag"):
+        assert torch.equal(getattr(plain, name), getattr(stated, name))
+
+
+def test_the_class_is_the_reference_term_of_the_budget(frames):
+    terms = {}
+    for sensor in (None, (0.0, 0.02, 0.0)):
+        method = METHODS["map"].replace(n=512, backproject={"sensor": sensor})
+        with torch.no_grad():
+            estimate = method(*frames)
+        relative = (estimate.budget.reference.sqrt() / estimate.depth)[estimate.keep]
+        terms[sensor] = float(relative.median())
+        torch.testing.assert_close(relative, torch.full_like(relative, terms[sensor]), rtol=1e-3, atol=0.0)
+    assert terms[None] == pytest.approx(0.01, rel=1e-3) and terms[0.0, 0.02, 0.0] == pytest.approx(0.02, rel=1e-3)
+
+
+@pytest.mark.parametrize("sensor", ["kinect", (0.01, 0.0), (1.0, 2.0, 3.0, 4.0), (-1.0, 0.0, 0.0)])
+def test_what_is_no_sensor_is_refused_in_one_line(sensor):
+    with pytest.raises(ValueError, match=r"sensor: found .*, expected ") as raised:
+        get_sensor_noise(sensor)
+    assert "\n" not in str(raised.value)
+
+
+def test_formats_that_name_their_device_are_formats_and_classes():
+    named = {name: sensor_of_format(name) for name in FORMATS if sensor_of_format(name)}
+    assert named["azure_kinect"] == "azure_kinect" and set(named.values()) <= set(SENSORS) and len(named) == 5
+    assert sensor_of_format("tum") is None
