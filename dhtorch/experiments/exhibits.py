@@ -22,7 +22,7 @@ from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.view_report import report_selection
-from dhtorch.records import Camera, DepthMap, Frame, Pose
+from dhtorch.records import Camera, DepthMap, Frame, Pose, SigmaBudget
 from dhtorch.viz.viewer.exhibit import (
     EMPTY_CLOUD,
     EMPTY_SWEPT_CLOUD,
@@ -112,6 +112,7 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
         "residual_px": estimate.residual_px,
         "error": torch.where(truth.ok & estimate.keep, error, torch.nan),
         "candidate": truth.ok,
+        "cause": _largest_cause(whole.source, estimate.budget),
     }
     T_world_from_0 = _in_world(reference)
     held_back = reference.replace(depth=batch.exact.depth, depth_camera=batch.exact.depth_camera)
@@ -188,7 +189,15 @@ def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
     xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)
     step = stride * frame.hw[1] / hw[1]
     points, rgb, sigmas, scores = (x[0].numpy() for x in (xyz.float(), _sample_colours(frame, uv), sigma, score))
-    return SweptPointCloud(points, rgb, sigmas, scores, step_px=step)
+    causes = (depth_map.budget.dominating + 1).flatten(1)[0, index].to(torch.uint8).numpy()
+    return SweptPointCloud(points, rgb, sigmas, scores, step_px=step, cause=causes)
+
+
+def _largest_cause(source: torch.Tensor, budget: SigmaBudget) -> torch.Tensor:
+    """1 + position of the largest cause of sigma of samples in :class:`SigmaBudget`; of a return ``reference``, 0 = no
+    depth."""
+    cause = torch.where(source == Source.NONE, 0, budget.dominating + 1)
+    return torch.where(source == Source.SENSOR, 1 + SigmaBudget.terms().index("reference"), cause)
 
 
 def _random_subset(places: torch.Tensor, most: int) -> torch.Tensor:

@@ -32,6 +32,7 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import completion, dense
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
+from dhtorch.records import DepthMap, SigmaBudget
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -442,3 +443,28 @@ def test_a_figure_of_silence_is_a_figure(tmp_path):
     draw_completed(tmp_path / "empty.png", np.zeros((1, 12, 16)), nothing, nothing, nothing, title="part $1$")
     assert pixels(tmp_path / "empty.png").size
     assert result_files.describe_difference({"config": {"a": 1}}, {"config": {"a": 2}}) == "a 1 there, 2 here"
+
+
+def test_budget_files_hold_the_largest_cause_and_sigma_follows_a_stated_sensor(captures, tmp_path):
+    out = tmp_path / "maps"
+    said(captures / "numbered", out, max_frames=1, budget=True, sensor=[0.02, 0.0, 0.0])
+    causes, source, sigma = (pixels(out / kind / "000000.png") for kind in ("budget", "source", "sigma"))
+    sensed = source == Source.SENSOR
+    assert sensed.any() and (causes[sensed] == 3).all(), "of a return all is the reference"
+    assert ((causes > 0) == (source > 0)).all()
+    row = json.loads((out / "meta" / "000000.json").read_text())
+    assert np.abs(sigma[sensed] * row["sigma_unit_m"] - 0.02).max() < row["sigma_unit_m"]
+    assert list(row["sigma_shares"]) == ["track", "pose", "reference", "lens", "model"]
+    with pytest.raises(ValueError, match="sensor: found 'kinect', expected one of"):
+        said(captures / "numbered", tmp_path / "wrong", sensor="kinect")
+
+
+def test_shares_of_sigma_are_those_of_estimated_pixels():
+    source = torch.tensor([[Source.SENSOR, Source.SWEPT, Source.SWEPT, Source.FILLED, Source.NONE]], dtype=torch.int32)
+    sigma = torch.tensor([[1.0, 2.0, 1.0, 1.0, torch.nan]])
+    terms = [torch.tensor([x]) for x in ([0.0, 3, 0, 0, 0], [0.0, 1, 1, 0, 0], *[[0.0] * 5] * 3)]
+    gate = torch.tensor([[Gate.ANSWER] * 4 + [Gate.NO_TRACK]], dtype=torch.int32)
+    causes, shares = complete._summarise_budget(DepthMap(3 * sigma, sigma, sigma, source, gate, SigmaBudget(*terms)))
+    assert causes.tolist() == [[3, 1, 2, 5, 0]] and causes.dtype == np.uint8
+    expected = {"track": 0.25, "pose": 0.25 / 3 + 1 / 3, "reference": 0.0, "lens": 0.0, "model": 1 / 3}
+    assert shares == pytest.approx(expected)

@@ -225,8 +225,12 @@ def test_the_page_holds_what_was_computed(scene):
         assert sent["counts"] == shot.gates()
         for name in ("xyz", "depth", "sigma", "error"):
             assert np.array_equal(unpacked(sent["samples"][name]), shot.samples[name].ravel(), equal_nan=True), name
-        for name in ("gate", "hole", "source", "tracked", "candidate"):
+        for name in ("gate", "hole", "source", "tracked", "candidate", "cause"):
             assert (unpacked(sent["samples"][name]) == shot.samples[name]).all(), name
+        has_depth = shot.samples["source"] > 0
+        assert ((shot.samples["cause"] > 0) == has_depth).all() and (shot.swept.cause > 0).all()
+        assert (shot.samples["cause"][shot.samples["source"] == Source.SENSOR] == 3).all(), "the reference"
+        assert (unpacked(sent["swept"]["cause"]) == shot.swept.cause).all()
         uv = unpacked(sent["samples"]["uv_1"]).reshape(-1, 2) / data["per_pixel"] - data["margin_px"]
         assert np.abs(uv - shot.samples["uv_1"])[shot.samples["tracked"]].max() <= 0.5 / data["per_pixel"] + 1e-4
         for name in ("seen", "swept"):

@@ -42,6 +42,7 @@ class SweptPointCloud(PointCloud):
     sigma: np.ndarray  # (P,) m, float32
     score: np.ndarray  # (P,) in [0, 1], float32
     step_px: float = 0.0  # spacing of the pixel grid that the points form, which makes a surface; 0 = no grid
+    cause: np.ndarray | None = None  # (P,) uint8, as ``cause`` of samples; None = not known
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class PairExhibit:
     ``samples`` holds arrays of N rows: ``uv_0``, ``uv_1`` (N, 2) px, ``tracked`` bool, ``xyz`` (N, 3) m in camera 0
     (NaN without an answer), ``rgb`` (N, 3) uint8 of the image, ``depth``, ``sigma`` m, ``score``,
     ``source``, ``gate``, ``hole``, ``parallax_deg``, ``residual_px``, ``error`` (|z − z*| / z* where a held-out return
-    passes the truth test, else NaN) and ``candidate`` (whether it does).
+    passes the truth test, else NaN) and ``candidate`` (whether it does); and, where known, ``cause`` (1 + position of
+    the largest term of a :class:`dhtorch.records.SigmaBudget`, 0 = no depth).
     """
 
     label: str

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Hole, names, words
+from dhtorch.records import SigmaBudget
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
-from dhtorch.viz.plots.colours import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
+from dhtorch.viz.plots.colours import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SERIES_COLOURS
 from dhtorch.viz.plots.document import build_style_sheet
 from dhtorch.viz.plots.markup import Markup, encode_png_uri, escape_html, make_tag
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud, SweptPointCloud
@@ -40,7 +41,7 @@ _MARGIN_PX = 64
 _COLUMN_TYPES = {
     **dict.fromkeys(("xyz", "depth", "sigma", "parallax_deg", "residual_px", "error"), "f4"),
     **dict.fromkeys(("uv_0", "uv_1", "score"), "u2"),
-    **dict.fromkeys(("rgb", "tracked", "source", "gate", "hole", "candidate"), "u1"),
+    **dict.fromkeys(("rgb", "tracked", "source", "gate", "hole", "candidate", "cause"), "u1"),
 }
 
 
@@ -119,6 +120,9 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
         "ramps": {name: colours.sample_cmap(kind) for name, kind in _CMAP_OF_QUANTITY.items()},
         "gates": gates,
         "holes": [_describe_code(code, name, HOLE_COLOURS) for code, name in names(Hole).items() if code != Hole.NONE],
+        "causes": [
+            {"code": 1 + k, "name": name, "colour": SERIES_COLOURS[k]} for k, name in enumerate(SigmaBudget.terms())
+        ],
         "outcomes": [{"key": key, "name": name, "colour": colour} for key, name, colour in outcomes],
         "views": [_encode_view(view) for view in scene.views],
         "shots": [_encode_pair(shot) for shot in scene.shots],
@@ -127,7 +131,8 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
 
 
 def _encode_pair(shot: PairExhibit) -> dict[str, Any]:
-    columns = {**shot.samples, "score": _quantise_scores(shot.samples["score"])}
+    unknown = np.zeros(len(shot.samples["depth"]), np.uint8)
+    columns = {"cause": unknown, **shot.samples, "score": _quantise_scores(shot.samples["score"])}
     for name in ("uv_0", "uv_1"):
         steps = np.round((np.nan_to_num(columns[name]) + _MARGIN_PX) * _STEPS_PER_PX)
         columns[name] = steps.clip(0, 65535)
@@ -169,6 +174,7 @@ def _encode_confidence(cloud: SweptPointCloud) -> dict[str, Any]:
     return {
         "sigma": _encode_array(cloud.sigma, "f4"),
         "score": _encode_array(_quantise_scores(cloud.score), "u2"),
+        "cause": _encode_array(np.zeros(len(cloud.xyz), np.uint8) if cloud.cause is None else cloud.cause, "u1"),
         "step_px": cloud.step_px,
     }
 

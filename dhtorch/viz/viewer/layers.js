@@ -19,11 +19,12 @@ const shots = DATA.shots.map((s) => {
   const columns = Object.fromEntries(Object.entries(s.samples).map(([name, packed]) => [name, unpack(packed)]));
   for (const name of ["uv_0", "uv_1"]) columns[name] = Float32Array.from(columns[name], (v) => v / DATA.per_pixel - DATA.margin_px);
   columns.score = Float32Array.from(columns.score, (v) => v / 65535);
-  const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535) };
+  const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535), cause: unpack(s.swept.cause) };
   swept.depth = Float32Array.from({ length: swept.n }, (_, k) => DATA.views.length ? swept.xyz[3 * k + 2] : Math.hypot(...swept.xyz.subarray(3 * k, 3 * k + 3))); // a map's origin is no camera
   return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held_out: cloud(s.held_out), swept };
 });
 const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
+const causeOf = Object.fromEntries(DATA.causes.map((c) => [c.code, c])), hasCauses = shots.some((s) => s.cause.some((c) => c) || s.swept.cause.some((c) => c));
 const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), UNANSWERED = hex(DATA.colours.unanswered);
 const PALE = hex(DATA.colours.pale), HIDDEN_RETURN = hex(DATA.colours.hidden_return), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
 const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
@@ -38,8 +39,8 @@ const scales = {
   score: new Scale([], "score", { log: false, range: [0, 1] }),
   error: new Scale(everything("error"), "error", { unit: "%", range: [0.003, 0.3] }),
 };
-const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
-  .filter(([key]) => key !== "error" || hasErrors);
+const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["cause", "largest cause of sigma"], ["error", "error against held-back returns"]]
+  .filter(([key]) => (key !== "error" || hasErrors) && (key !== "cause" || hasCauses));
 const state = { now: 0, all: false, mode: "picture", threshold: 0, picked: null, playing: null };
 const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].map((box) => [box.dataset.show, box.checked]));
 
@@ -47,6 +48,7 @@ const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].ma
 function sampleColour(s, k) {
   const mode = state.mode, source = s.source[k];
   if (mode === "hole") return holeOf[s.hole[k]] ? hex(holeOf[s.hole[k]].colour) : SENSOR;
+  if (mode === "cause") return source && causeOf[s.cause[k]] ? hex(causeOf[s.cause[k]].colour) : UNANSWERED;
   if (mode === "gate") return source === 1 ? SENSOR : source === 2 ? RECOVERED : hex(gateOf[s.gate[k]]?.colour || DATA.colours.unanswered);
   if (mode === "source" || mode === "picture") return [UNANSWERED, SENSOR, RECOVERED][source];
   if (source === 0 || (source === 1 && mode !== "depth")) return source ? PALE : UNANSWERED;
@@ -59,7 +61,7 @@ function returnColour(cloud, k, heldOut) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb);
   if (state.mode === "picture") return rgb;
   if (state.mode === "depth") return scales.depth.colour(cloud.xyz[3 * k + 2]).map((v) => v * (0.5 + 0.6 * grey));
-  if (scales[state.mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
+  if (scales[state.mode] || state.mode === "cause") return PALE.map((v) => 0.67 * v + 0.45 * grey);
   if (heldOut) return HIDDEN_RETURN.map((v) => v * (0.5 + grey));
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
@@ -68,6 +70,7 @@ function returnColour(cloud, k, heldOut) {
 function sweptColour(cloud, k) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb), mode = state.mode;
   if (mode === "picture") return rgb;
+  if (mode === "cause" && causeOf[cloud.cause[k]]) return hex(causeOf[cloud.cause[k]].colour).map((v) => v * (0.5 + 0.6 * grey));
   const value = { depth: cloud.depth[k], sigma: cloud.sigma[k] / cloud.depth[k], score: cloud.score[k] }[mode];
   if (value !== undefined) return scales[mode].colour(value).map((v) => v * (0.5 + 0.6 * grey));
   if (scales[mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);

@@ -74,6 +74,7 @@ function tellSample() {
   if (k === null) return facts($("sample-facts"), {});
   const source = s.source[k], sampleFacts = { sample: k, source: ["none", "sensor", "recovered", "swept"][source] };
   if (source) sampleFacts.depth = `${short(s.depth[k])} m ± ${short(s.sigma[k])} m (${percent(s.sigma[k] / s.depth[k])})`;
+  if (source && causeOf[s.cause[k]]) sampleFacts["sigma mostly from"] = causeOf[s.cause[k]].name;
   if (source) sampleFacts[source === 1 ? "confidence" : "score"] = s.score[k].toFixed(2);
   if (source === 0) sampleFacts["no answer because of"] = gateOf[s.gate[k]]?.name ?? s.gate[k];
   if (source !== 1 && holeOf[s.hole[k]]) sampleFacts["no return because of"] = holeOf[s.hole[k]].name;
@@ -94,6 +95,7 @@ function tellColours() {
     const seen = (name, code, want) => shots.some((s) => s[name].some((v, k) => v === code && want(s.source[k])));
     const list = mode === "hole" ? [[DATA.colours.sensor, "sensor"], ...DATA.holes.filter((h) => seen("hole", h.code, (x) => x !== 1)).map((h) => [h.colour, h.name])]
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
+      : mode === "cause" ? DATA.causes.filter((c) => shots.some((s) => s.cause.includes(c.code) || s.swept.cause.includes(c.code))).map((c) => [c.colour, c.name])
       : mode === "picture" ? []
       : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.unanswered, "no answer (in the images)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
