@@ -182,6 +182,17 @@ class Source(CodeTable):
     FILLED: Final = code(5, "a pixel of a dense map, interpolated from neighbours on the same surface")
 
 
+class Cause(CodeTable):
+    """Codes of the terms of sigma², see :class:`dhtorch.records.SigmaBudget`."""
+
+    NONE: Final = code(0, "no answer")
+    TRACK: Final = code(1, "the point's own match")
+    POSE: Final = code(2, "the relative pose")
+    REFERENCE: Final = code(3, "the depth sensor: what all its returns have in common")
+    LENS: Final = code(4, "intrinsics, distortion and rows")
+    MODEL: Final = code(5, "joining, filling or calibration: what no other term explains")
+
+
 class State(CodeTable):
     """Codes of the pixels of a validated depth map."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, PoseCode, Source, State
+from dhtorch.codes import Cause, Gate, PoseCode, Source, State
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.geometry.checks import all_finite
 from dhtorch.geometry.coarse_flow import CoarseFlow
@@ -221,16 +221,17 @@ class SigmaBudget(Record):
         """The five terms in their order."""
         return self.track, self.pose, self.reference, self.lens, self.model
 
-    @classmethod
-    def terms(cls) -> tuple[str, ...]:
-        """The names of the terms in their order."""
-        return "track", "pose", "reference", "lens", "model"
+    def shares(self, where: Tensor) -> dict[str, float]:
+        """Name of a term → its mean share in sigma² over the answers ``where`` (bool); empty without one."""
+        values = torch.stack([x[where].detach() for x in self.values()])
+        mean = (values / values.sum(0)).mean(1).tolist() if values.numel() else []
+        return dict(zip(("track", "pose", "reference", "lens", "model"), mean, strict=False))
 
     @property
     def dominating(self) -> Tensor:
-        """Index of the largest term, int64: 0 track, 1 pose, 2 reference, 3 lens, 4 model; -1 where unanswered."""
+        """Code of the largest term, int32, codes.Cause; NONE where unanswered."""
         terms = torch.stack([x.detach() for x in self.values()])
-        return torch.where(terms.isfinite().all(0), terms.argmax(0), -1)
+        return torch.where(terms.isfinite().all(0), Cause.TRACK + terms.argmax(0), Cause.NONE).int()
 
     @classmethod
     def single(cls, term: str, variance: Tensor) -> SigmaBudget:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dhtorch.calibration.score_calibration import SigmaModel
-from dhtorch.codes import Source
+from dhtorch.codes import Cause, Source
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.presets import METHODS
@@ -51,7 +51,9 @@ def test_the_terms_sum_to_the_square_of_sigma_and_are_empty_where_unanswered(ans
     assert int(keep.sum()) > 300
     torch.testing.assert_close(total(budget)[keep], answer.sigma.square()[keep], rtol=2e-6, atol=0.0)
     assert all(bool((x[keep] >= 0).all()) and bool(x[~keep].isnan().all()) for x in budget.values())
-    assert bool((budget.dominating[~keep] == -1).all()) and bool((budget.dominating[keep] >= 0).all())
+    assert bool((budget.dominating[~keep] == Cause.NONE).all()) and bool((budget.dominating[keep] >= Cause.TRACK).all())
+    largest = torch.stack(budget.values()).amax(0)
+    assert torch.equal((budget.track == largest)[keep], (budget.dominating == Cause.TRACK)[keep])
 
 
 @pytest.mark.parametrize("name", ["paper", "kornia", "map", "window", "auto", "fused", "plain", "calibrated"])

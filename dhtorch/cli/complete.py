@@ -36,7 +36,7 @@ from dhtorch.pipeline.presets import with_sensor
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import report_selection, with_view_selection
 from dhtorch.pytree import stack
-from dhtorch.records import DepthMap, Frame, SigmaBudget
+from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
@@ -293,13 +293,11 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
 
 
 def _summarise_budget(depth_map: DepthMap) -> tuple[np.ndarray, Row]:
-    """Map (h, w) -> the largest cause of sigma of every pixel as uint8 (0 no answer, 1 + the position in
-    :class:`dhtorch.records.SigmaBudget`), and the mean share of each cause in sigma² over the estimated pixels."""
-    budget, estimated = depth_map.budget, depth_map.keep & is_estimated(depth_map.source)
-    total = depth_map.sigma[estimated].square()
-    terms = {name: getattr(budget, name)[estimated] for name in SigmaBudget.terms()}
-    shares = {name: float((x / total).mean()) if len(total) else None for name, x in terms.items()}
-    return (budget.dominating + 1).to(torch.uint8).numpy(), shares
+    """Map (h, w) -> the largest cause of every pixel's sigma as uint8, codes.Cause, and the mean share of each cause in
+    sigma² over the estimated pixels."""
+    budget = depth_map.budget
+    shares = budget.shares(depth_map.keep & is_estimated(depth_map.source))
+    return budget.dominating.to(torch.uint8).numpy(), shares
 
 
 def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:

@@ -197,6 +197,7 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
         views=views,
         seed=settings["seed"],
         dense=settings["dense"],
+        budget="cause" in settings["columns"],
         **_pose_options(settings),
     )
     target = _open_target(settings, inputs, out, format, shared["key"], origin, n=method.n)
@@ -458,8 +459,8 @@ def _check_options(settings: Mapping[str, Any]) -> None:
     known = (*MAP_FILES, *POLICY_COLUMNS)
     if not isinstance(wanted, Sequence) or isinstance(wanted, str) or not {"depth"} <= {*wanted} <= {*known}:
         raise ValueError(f"columns: found {wanted!r}, expected depth and any of {', '.join(known)}, as a list")
-    if settings["format"] == "nerfstudio" and {*wanted} & {*POLICY_COLUMNS}:
-        more = ", ".join(name for name in POLICY_COLUMNS if name in wanted)
+    if settings["format"] == "nerfstudio" and {*wanted} & {*POLICY_COLUMNS, "cause"}:
+        more = ", ".join(name for name in (*POLICY_COLUMNS, "cause") if name in wanted)
         raise ValueError(f"columns: found {more} with format=nerfstudio, expected a LeRobot format")
     for name in ("causal", "report", "cameras"):
         if not isinstance(settings[name], bool):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.codes import Source, is_estimated
+from dhtorch.codes import Cause, Source, is_estimated
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments import protocol
@@ -189,15 +189,14 @@ def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
     xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)
     step = stride * frame.hw[1] / hw[1]
     points, rgb, sigmas, scores = (x[0].numpy() for x in (xyz.float(), _sample_colours(frame, uv), sigma, score))
-    causes = (depth_map.budget.dominating + 1).flatten(1)[0, index].to(torch.uint8).numpy()
+    causes = depth_map.budget.dominating.flatten(1)[0, index].to(torch.uint8).numpy()
     return SweptPointCloud(points, rgb, sigmas, scores, step_px=step, cause=causes)
 
 
 def _largest_cause(source: torch.Tensor, budget: SigmaBudget) -> torch.Tensor:
-    """1 + position of the largest cause of sigma of samples in :class:`SigmaBudget`; of a return ``reference``, 0 = no
-    depth."""
-    cause = torch.where(source == Source.NONE, 0, budget.dominating + 1)
-    return torch.where(source == Source.SENSOR, 1 + SigmaBudget.terms().index("reference"), cause)
+    """Largest cause of sigma of samples, codes.Cause; of a return REFERENCE."""
+    cause = torch.where(source == Source.NONE, Cause.NONE, budget.dominating)
+    return torch.where(source == Source.SENSOR, Cause.REFERENCE, cause)
 
 
 def _random_subset(places: torch.Tensor, most: int) -> torch.Tensor:

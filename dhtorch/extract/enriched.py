@@ -219,7 +219,8 @@ def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> dict[str,
     """Columns of the transform -> maps (h, w) by name, and ``gate``; without dense maps only sampled pixels are set."""
     kinds: dict[str, Any] = {name: MAP_DTYPES[str(c.enrich)] for name, c in MAP_FILES.items()} | {"gate": np.int64}
     if "depth_map" in added:
-        return {name: added[f"{name}_map"].numpy().astype(kind) for name, kind in kinds.items()}
+        unasked = torch.zeros_like(added["gate_map"])  # of columns whose option is off
+        return {name: added.get(f"{name}_map", unasked).numpy().astype(kind) for name, kind in kinds.items()}
     h, w = view.map_hw
     scale = np.array([w / view.hw[1], h / view.hw[0]])
     pixel = np.rint((added["uv"].double().numpy() + 0.5) * scale - 0.5).astype(np.int64).clip(0, (w - 1, h - 1))

@@ -46,6 +46,7 @@ class ExtendDepth(torch.nn.Module):
         dense: True = also a dense depth map, with the defaults of :func:`dhtorch.pipeline.completion.complete_depth`;
             a mapping = options for it: ``source_views``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
             ``max_sigma_rel``. Sigma and score of swept pixels are calibrated with the package's default calibration.
+        budget: with ``dense`` also the largest cause of every pixel's sigma, ``cause_map``.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transforms.patch_tokens`.
         on_error: what to do with a sample that cannot be read, or whose values contradict the options. ``raise``;
             ``skip`` = return None, see :func:`dhtorch.transforms.collate_kept`; ``flag`` = add zeros and set
@@ -90,6 +91,7 @@ class ExtendDepth(torch.nn.Module):
         seed: int = 0,
         index_key: str | None = None,
         dense: bool | Mapping[str, Any] = False,
+        budget: bool = False,
         patch: int = 14,
         tokens_hw: tuple[int, int] | None = None,
         fit: str = "stretch",
@@ -109,6 +111,7 @@ class ExtendDepth(torch.nn.Module):
         token_grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises if no patch fits
         self.views = SampleSpec(**views)
         self.maps = maps.DenseMaps.from_options(dense)
+        self.budget = budget and self.maps is not None
         self.method, self.hint = method, hint
         self.learned = torch.nn.ModuleList(iter_networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
@@ -256,7 +259,7 @@ class ExtendDepth(torch.nn.Module):
 
     def _column_options(self) -> list[str]:
         """The active options that add columns, see :mod:`dhtorch.transforms.schema`."""
-        active = {"pose": self.views.pose is not None, "dense": self.maps is not None}
+        active = {"pose": self.views.pose is not None, "dense": self.maps is not None, "budget": self.budget}
         return [option for option, is_active in active.items() if is_active]
 
     def _count_problems(self, problem: Tensor, hw: tuple[int, int]) -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source
+from dhtorch.codes import Cause, Flag, Gate, Hole, PoseCode, Source
 from dhtorch.records import DepthMap, Estimate, MergedDepth, PoseFit, Samples
 from dhtorch.transforms.maps import zero_unanswered
 from dhtorch.transforms.poses import match_refuted_poses
@@ -154,6 +154,10 @@ def _source_map(results: SampleResults) -> Tensor:
     return _dense(results).source
 
 
+def _cause_map(results: SampleResults) -> Tensor:
+    return _dense(results).budget.dominating
+
+
 def _gate_map(results: SampleResults) -> Tensor:
     return _dense(results).gate
 
@@ -273,6 +277,17 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         _source_map,
         codes=Source,
         option="dense",
+        enrich="png",
+    ),
+    ColumnSpec(
+        "cause_map",
+        _MAP,
+        "int32",
+        "code",
+        "largest cause of a pixel's sigma",
+        _cause_map,
+        codes=Cause,
+        option="budget",
         enrich="png",
     ),
     ColumnSpec("gate_map", _MAP, "int32", "code", "why a pixel has no depth", _gate_map, codes=Gate, option="dense"),

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.codes import CodeTable, Gate, Hole, Source, State, names
+from dhtorch.codes import Cause, CodeTable, Gate, Hole, Source, State, names
 
 #: What a depth comes from; pixels without an answer are paler.
 SENSOR, RECOVERED, SWEPT, ALIGNED, UNANSWERED = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
@@ -104,6 +104,9 @@ _SOURCE_COLOURS = {
 }
 
 SOURCE_COLOURS = _with_defaults(Source, _SOURCE_COLOURS)
+
+#: Largest cause of a sigma.
+CAUSE_COLOURS = _with_defaults(Cause, dict(enumerate(SERIES_COLOURS, start=Cause.TRACK)), Cause.NONE)
 
 #: State of a pixel of a validated map.
 _STATE_COLOURS = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}

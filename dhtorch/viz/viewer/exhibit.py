@@ -65,8 +65,7 @@ class PairExhibit:
     ``samples`` holds arrays of N rows: ``uv_0``, ``uv_1`` (N, 2) px, ``tracked`` bool, ``xyz`` (N, 3) m in camera 0
     (NaN without an answer), ``rgb`` (N, 3) uint8 of the image, ``depth``, ``sigma`` m, ``score``,
     ``source``, ``gate``, ``hole``, ``parallax_deg``, ``residual_px``, ``error`` (|z − z*| / z* where a held-out return
-    passes the truth test, else NaN) and ``candidate`` (whether it does); and, where known, ``cause`` (1 + position of
-    the largest term of a :class:`dhtorch.records.SigmaBudget`, 0 = no depth).
+    passes the truth test, else NaN) and ``candidate`` (whether it does); and, where known, ``cause`` (codes.Cause).
     """
 
     label: str

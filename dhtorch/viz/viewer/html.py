@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.codes import Gate, Hole, names, words
-from dhtorch.records import SigmaBudget
+from dhtorch.codes import Cause, Gate, Hole, names, words
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
-from dhtorch.viz.plots.colours import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SERIES_COLOURS
+from dhtorch.viz.plots.colours import CAUSE_COLOURS, GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
 from dhtorch.viz.plots.document import build_style_sheet
 from dhtorch.viz.plots.markup import Markup, encode_png_uri, escape_html, make_tag
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud, SweptPointCloud
@@ -120,9 +119,7 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
         "ramps": {name: colours.sample_cmap(kind) for name, kind in _CMAP_OF_QUANTITY.items()},
         "gates": gates,
         "holes": [_describe_code(code, name, HOLE_COLOURS) for code, name in names(Hole).items() if code != Hole.NONE],
-        "causes": [
-            {"code": 1 + k, "name": name, "colour": SERIES_COLOURS[k]} for k, name in enumerate(SigmaBudget.terms())
-        ],
+        "causes": [_describe_code(code, name, CAUSE_COLOURS) for code, name in names(Cause).items() if code],
         "outcomes": [{"key": key, "name": name, "colour": colour} for key, name, colour in outcomes],
         "views": [_encode_view(view) for view in scene.views],
         "shots": [_encode_pair(shot) for shot in scene.shots],
