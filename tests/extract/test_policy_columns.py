@@ -14,6 +14,7 @@ from support.dataset_folders import decode_map, read_rows
 from dhtorch import data, functional
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
+from dhtorch.codes import Cause, Source, names
 from dhtorch.data.codecs.video import read_video_frame, read_video_header, read_video_times
 from dhtorch.export.video import open_lossless_video
 from dhtorch.extract.policy_columns import N_POINTS, make_modality
@@ -22,7 +23,7 @@ from dhtorch.synthetic.recording import SyntheticRoom
 HW, LENGTHS, FPS = (48, 64), (3, 2), 30
 CAMERA = "observation.images.front"
 PICTURE, CLOUD = f"{CAMERA}_geometry_image", "observation.front.point_cloud"
-COLUMNS = "columns=[depth,sigma,source,geometry_image,point_cloud]"
+COLUMNS = "columns=[depth,sigma,source,cause,geometry_image,point_cloud]"
 QUICK = ["method=paper", "method.n=64", "method.hypotheses=8", "gap=1", "dense={size: 32, planes: 8}", "report=false"]
 
 
@@ -84,6 +85,15 @@ def test_every_byte_of_the_video_is_that_of_the_maps(enriched):
         assert np.array_equal(actual, image.repeat(2, 0).repeat(2, 1))
     for file in files:
         assert np.allclose(read_video_times(file), np.arange(read_video_header(file).n) / read_info(enriched)["fps"])
+
+
+def test_the_largest_cause_of_sigma_is_a_map_beside_the_source(enriched):
+    camera, *_ = columns_of(enriched)
+    codes = read_info(enriched)["features"][f"{camera}_dhtorch_cause"]["info"]["codes"]
+    assert codes == {str(code): name.lower() for code, name in names(Cause).items()}
+    for row in read_rows(enriched):
+        cause, origin = (decode_map(row, f"{camera}_dhtorch_{name}").reshape(24, 32) for name in ("cause", "source"))
+        assert ((cause > 0) == (origin > 0)).all() and (cause[origin == Source.SENSOR] == Cause.REFERENCE).all()
 
 
 def test_its_feature_states_the_decoding_and_statistics_are_there(enriched):
@@ -157,7 +167,7 @@ def test_the_card_states_the_decoding(enriched):
     ("words", "text"),
     [
         (["columns=[depth,pictures]"], "geometry_image, point_cloud"),
-        ([COLUMNS, "format=nerfstudio"], "geometry_image, point_cloud with format=nerfstudio"),
+        ([COLUMNS, "format=nerfstudio"], "geometry_image, point_cloud, cause with format=nerfstudio"),
     ],
 )
 def test_other_columns_and_formats_are_refused_in_a_line(words, text, source, tmp_path, capsys):
