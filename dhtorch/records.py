@@ -249,8 +249,9 @@ class SigmaBudget(Record):
         total = terms[0] + terms[1] + terms[2] + terms[3] + terms[4]
         split = total > 0
         factor = sigma.square() / torch.where(split, total, 1.0)
-        *known, model = (torch.where(split, x, 0.0) * factor for x in terms)
-        return SigmaBudget(*known, model + torch.where(split, 0.0, 1.0) * sigma.square())
+        track, pose, reference, lens, model = (torch.where(split, x, 0.0) * factor for x in terms)
+        model = model + torch.where(split, 0.0, 1.0) * sigma.square()
+        return SigmaBudget(track, pose, reference, lens, model)
 
 
 def depth_interval(depth: Tensor, sigma: Tensor, k: float = 2.0) -> tuple[Tensor, Tensor]:

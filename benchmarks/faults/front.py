@@ -7,7 +7,7 @@ TESTS: dict[str, list[str]] = {
         "tests/stages/test_front_end.py",
         "tests/test_contract.py",
     ],
-    "stages.sensor_noise": ["tests/stages/test_sensor_noise.py"],
+    "geometry.sensor_noise": ["tests/geometry/test_sensor_noise.py"],
     "stages.holes": ["tests/stages/test_holes.py", "tests/stages/test_front_end.py", "tests/test_contract.py"],
     "stages.triangulate": [
         "tests/stages/test_two_view.py",
@@ -19,9 +19,9 @@ TESTS: dict[str, list[str]] = {
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "stages.sensor_noise": [
-        ("__call__", "self.square * depth * depth", "self.square * depth"),
-        ("__call__", " * (depth > 0)", ""),
+    "geometry.sensor_noise": [
+        ("SensorNoise.__call__", "self.square * depth * depth", "self.square * depth"),
+        ("SensorNoise.__call__", " * (depth > 0)", ""),
         ("get_sensor_noise", "len(sensor) != 3 or ", ""),
     ],
     "stages.sample": [

@@ -17,6 +17,7 @@ TESTS: dict[str, list[str]] = {
         "tests/stages/test_fuse.py",
         "tests/pipeline/test_multiview.py",
         "tests/stages/test_contradicted.py",
+        "tests/test_sigma_budget.py",
     ],
     "pipeline.view_selection": [
         "tests/pipeline/test_few_returns.py",
@@ -24,7 +25,7 @@ TESTS: dict[str, list[str]] = {
         "tests/stages/test_inverse_variance.py",
         "tests/pipeline/test_guided.py",
     ],
-    "stages.shared_error": ["tests/stages/test_shared_error.py"],
+    "stages.shared_error": ["tests/stages/test_shared_error.py", "tests/test_sigma_budget.py"],
     "pipeline.stream": ["tests/pipeline/test_stream.py"],
     "pipeline.multiview": ["tests/stages/test_inverse_variance.py", "tests/pipeline/test_multiview.py"],
     "pipeline.view_report": ["tests/pipeline/test_view_report.py"],
@@ -172,6 +173,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Stream.push", "Gate.NO_BASELINE", "Gate.ANSWER"),
     ],
     "stages.fuse": [
+        ("_joint_parts", "pose - reference - lens", "pose - reference"),
+        ("_joint_parts", "/ square * depth.square()", ""),
         ("_contradicted_gate", "contradicted > answering", "contradicted >= answering"),
         ("fuse_consistent", "gate = _contradicted_gate(estimates, gate)", "gate = gate"),
         ("fuse_consistent", "inverse.square() / variance", "1 / variance"),
@@ -238,6 +241,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("verify_views", "< min_ratio)", "> min_ratio)"),
         ("verify_views", "(refuted >= max_refuted)", "(refuted > max_refuted)"),
         ("_rotation_angle", ".clamp_min(MIN_TURN)", ""),
+        ("_widen", "parts.lens + added", "parts.lens"),
         ("_widen", "relative * torch.where(keep, estimates.depth, 1.0)", "relative"),
         ("_widen", "torch.where(keep, estimates.depth, 1.0)", "estimates.depth"),
         ("_withhold", "lost = estimates.keep & rejected", "lost = estimates.keep & rejected.any()"),

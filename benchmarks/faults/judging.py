@@ -8,6 +8,7 @@ TESTS: dict[str, list[str]] = {
     "metrics.holdout": ["tests/metrics/test_holdout.py"],
     "metrics.risk": ["tests/metrics/test_risk.py"],
     "metrics.reliability": ["tests/metrics/test_reliability.py"],
+    "metrics.uncertainty": ["tests/metrics/test_uncertainty.py"],
     "calibration.monotone": ["tests/calibration/test_monotone.py"],
     "calibration.score_calibration": ["tests/calibration/test_score_calibration.py"],
     "experiments.compare_methods": ["tests/experiments/test_compare_methods.py"],
@@ -16,6 +17,14 @@ TESTS: dict[str, list[str]] = {
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
+    "metrics.uncertainty": [
+        ("range_bias", "answered.true_depth.log()", "answered.depth.log()"),
+        ("range_bias", "error.numel() >= min_answers", "error.numel() > 0"),
+        ("interval_coverage", "answered.sigma.isfinite()", "(answered.sigma > 0)"),
+        ("interval_coverage", "(stated.true_depth >= low) & ", ""),
+        ("disjoint_agreement", "variance + other_variance", "variance"),
+        ("_independent_part", " - estimate.budget.reference", ""),
+    ],
     "metrics.bootstrap": [
         ("interval_over_scenes", "v is not None and math.isfinite(v)", "v is not None and not math.isnan(v)"),
         ("interval_over_scenes", "level=level, draws=draws, seed=seed", "level=level, draws=draws"),

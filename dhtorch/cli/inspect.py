@@ -33,10 +33,10 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.survey import survey_stacks
+from dhtorch.geometry.sensor_noise import sensor_of_format
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
-from dhtorch.stages.sensor_noise import sensor_of_format
 from dhtorch.validation.capture_check import check_capture
 from dhtorch.viz.plots.canvas import format_capture_name
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED

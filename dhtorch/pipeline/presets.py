@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from dhtorch.geometry.coarse_flow import coarse_flow
+from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.pipeline.fused import fuse_with_sweep
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.view_selection import select_views_by_preview
@@ -18,7 +19,6 @@ from dhtorch.stages.kornia.track import lucas_kanade_kornia
 from dhtorch.stages.kornia.triangulate import two_view_kornia
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
-from dhtorch.stages.sensor_noise import get_sensor_noise
 from dhtorch.stages.shared_error import verify_views
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.track_chain import track_chain
@@ -103,7 +103,7 @@ def with_sensor(method: Method, sensor: str | Sequence[float] | None) -> Method:
     """The method with the noise of a class of sensors, or of three numbers; None = as it is.
 
     Raises:
-        ValueError: as :func:`dhtorch.stages.sensor_noise.get_sensor_noise`.
+        ValueError: as :func:`dhtorch.geometry.sensor_noise.get_sensor_noise`.
     """
     if sensor is None:
         return method

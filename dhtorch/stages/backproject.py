@@ -28,10 +28,10 @@ from dhtorch.geometry.patches import (
     whole_is_faster,
     window_arguments,
 )
+from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
 from dhtorch.ops.dispatch import operator
 from dhtorch.records import Camera, Frame, Samples
-from dhtorch.stages.sensor_noise import get_sensor_noise
 
 #: Limits the search for a return in a sparse depth map: Chebyshev radius in depth pixels.
 #: Source: derived, (7 − 1) / 2 of the 7×7 windows in which ``metrics.holdout`` reads sparse returns.
@@ -83,7 +83,7 @@ def backproject(
         dark, saturated: mean grey of the neighbourhood below / above which UNDEREXPOSED / SATURATED is set.
         highlight: a colourless pixel above it that is brighter than its neighbourhood is SPECULAR.
         sensor: class of the sensor, whose noise by range replaces ``sigma_m`` and ``sigma_rel``, or three numbers
-            (:data:`dhtorch.stages.sensor_noise.SENSORS`); None = not stated.
+            (:data:`dhtorch.geometry.sensor_noise.SENSORS`); None = not stated.
 
     Returns:
         Samples with ``trackability`` 0 and ``hole`` NONE: the next stage fills them. ``confidence`` is the sensor's

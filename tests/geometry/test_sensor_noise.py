@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from dhtorch.data import FORMATS
+from dhtorch.geometry.sensor_noise import SENSORS, get_sensor_noise, sensor_of_format
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.stages.backproject import backproject
-from dhtorch.stages.sensor_noise import SENSORS, get_sensor_noise, sensor_of_format
 from dhtorch.synthetic import SyntheticRoom
 
 
