@@ -10,6 +10,7 @@ metres (``# metres``) with their images, and the times of these in ``times.txt``
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,8 +33,8 @@ _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 #: Poses of the layout of numbered frames; where they are, they win over an estimate.
 _OWN_POSES = ("poses.txt", "pose.txt")
 
-#: Model → numbers of focal lengths and of distortion coefficients. Source: COLMAP's camera models.
-_MODELS = {
+#: Camera model → numbers of focal lengths and of distortion coefficients. Source: COLMAP's camera models.
+COLMAP_LENSES = {
     "SIMPLE_PINHOLE": (1, 0),
     "PINHOLE": (2, 0),
     "SIMPLE_RADIAL": (1, 1),
@@ -80,7 +81,7 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
         problem = "none beside the model" if images is None else f"no folder {images}"
         raise FormatError(root, "images", problem, "images/, or data.images=FOLDER and data.depth=FOLDER")
     maps = root / "depth" if depth is None else _join(root, depth)
-    lenses = _read_cameras(model / "cameras.txt")
+    lenses = read_colmap_cameras(model / "cameras.txt")
     times = _read_times(model / "times.txt")
     rows, missing = [], []
     for entry in _read_images(model / "images.txt"):
@@ -129,8 +130,8 @@ def _find_depth(folder: Path, image: Path) -> Path | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lens:
-    """One line of ``cameras.txt``."""
+class ColmapLens:
+    """A camera of a model."""
 
     hw: tuple[int, int]
     K: np.ndarray  # (3, 3), pixel centres at integers
@@ -147,22 +148,31 @@ class _ImageEntry:
     c2w: np.ndarray  # (4, 4)
 
 
-def _read_cameras(file: Path) -> dict[int, _Lens]:
-    """Camera id → camera."""
+def read_colmap_cameras(file: Path) -> dict[int, ColmapLens]:
+    """Camera id → camera, of ``cameras.txt``.
+
+    Raises:
+        FormatError: a camera model without OpenCV's distortion, or a damaged file.
+    """
     lenses = {}
     for line, words in files.read_rows(file):
         model = words[1] if len(words) > 1 else ""
-        if model not in _MODELS:
-            raise FormatError(file, f"line {line} model", model, f"{', '.join(_MODELS)} (undistort the images first)")
-        n_focal, n_lens = _MODELS[model]
-        values = _parse_numbers(words[2:], 2 + n_focal + 2 + n_lens, file, line)
-        focal, (cx, cy), lens = values[2 : 2 + n_focal], values[2 + n_focal : 4 + n_focal], values[4 + n_focal :]
-        padded = [*lens, *[0.0] * (4 - len(lens))] if lens else []
-        K = convert.make_K(focal[0], focal[-1], cx - 0.5, cy - 0.5)
+        if model not in COLMAP_LENSES:
+            expected = f"{', '.join(COLMAP_LENSES)} (undistort the images first)"
+            raise FormatError(file, f"line {line} model", model, expected)
+        values = _parse_numbers(words[2:], 4 + sum(COLMAP_LENSES[model]), file, line)
         w, h = (round(files.to_positive(size, file, f"line {line} size")) for size in values[:2])
-        hw = h, w
-        lenses[_parse_id(words[0], file, line)] = _Lens(hw, K, tuple(padded) if any(padded) else None)
+        lenses[_parse_id(words[0], file, line)] = make_colmap_lens(model, (h, w), values[2:])
     return lenses
+
+
+def make_colmap_lens(model: str, hw: tuple[int, int], values: Sequence[float]) -> ColmapLens:
+    """Parameters of a camera model of :data:`COLMAP_LENSES` → camera with pixel centres at integers."""
+    n_focal, _ = COLMAP_LENSES[model]
+    focal, (cx, cy), lens = values[:n_focal], values[n_focal : n_focal + 2], values[n_focal + 2 :]
+    padded = [*lens, *[0.0] * (4 - len(lens))] if lens else []
+    K = convert.make_K(focal[0], focal[-1], cx - 0.5, cy - 0.5)
+    return ColmapLens(hw, K, tuple(padded) if any(padded) else None)
 
 
 def _read_images(file: Path) -> list[_ImageEntry]:
