@@ -17,7 +17,7 @@ ROOT = Path(dhtorch.__file__).parent
 FLOORS = (
     {"cli"},
     {"extract", "experiments"},
-    {"transforms"},
+    {"transforms", "measure"},
     {"validation", "integrate", "synthetic"},
     {"pipeline", "testing", "functional"},
     {"calibration"},

@@ -318,6 +318,21 @@ COMMANDS: dict[str, Command] = {
         ),
         exit_line=_LIMIT_EXIT_LINE,
     ),
+    "scale": Command(
+        _CHECKS,
+        "a reconstruction (COLMAP, nerfstudio, VGGT, splats) in metres, or where it is bent",
+        "MODEL CAPTURE",
+        "Measures the size of a reconstruction with the near returns of an RGB-D capture of the same scene, and "
+        "writes the model in metres in its own format, scale.json and scale.html (scale by frame, picture region "
+        "and range). A model whose parts have different scales is refused, with where and how much.",
+        (
+            ("MODEL CAPTURE", "a COLMAP folder, transforms.json, npz files or a splat's PLY"),
+            ("MODEL CAPTURE --sensor iphone_lidar", "with the accuracy and range of the capture's sensor"),
+            ("MODEL CAPTURE --frame capture --out DIR", "also turned and moved to the capture's poses"),
+        ),
+        ("out", "images", "sensor", "cutoff", "frame", "max_frames", "tolerance", "fov", "depth_unit"),
+        exit_line="Exit code: 0 done, 1 the model is refused, 2 bad option or bad data, 130 interrupted.",
+    ),
     "run": Command(
         _STUDIES,
         "an experiment with hidden depth as ground truth, or a sweep",

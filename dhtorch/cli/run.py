@@ -48,6 +48,7 @@ _CONFIGURED_COMMANDS = {
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
     "recover": "dhtorch.cli.process_capture",
+    "scale": "dhtorch.cli.scale",
     "stream": "dhtorch.cli.stream",
     "validate": "dhtorch.cli.validate",
     "view": "dhtorch.cli.view",
@@ -58,6 +59,7 @@ _POSITIONAL_OPTIONS = {
     **dict.fromkeys(("align", "complete", "extract", "integrate", "run", "stream", "validate"), ("data.root",)),
     "enrich": ("data.root", "out"),
     "recover": ("path",),
+    "scale": ("model", "data.root"),
     "view": ("result",),
 }
 
@@ -65,7 +67,7 @@ _POSITIONAL_OPTIONS = {
 _SUBSAMPLED_COMMANDS = {"extract": True, "integrate": True, "stream": True, "view": False}
 
 #: Sub-commands whose result is empty without sensor depth.
-_DEPTH_COMMANDS = ("align", "complete", "enrich", "integrate", "stream")
+_DEPTH_COMMANDS = ("align", "complete", "enrich", "integrate", "scale", "stream")
 
 #: Experiments that hide sensor depth and recover it.
 _DEPTH_EXPERIMENTS = ("pair", "range_split", "method_comparison")
@@ -79,7 +81,7 @@ EXIT_SIGHUP, EXIT_SIGTERM = 129, 143
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
     EXIT_DONE: "all done or left untouched",
-    EXIT_SOME_FAILED: "some jobs of a sweep failed, or validated or aligned depth exceeds a limit of fail_on",
+    EXIT_SOME_FAILED: "some jobs of a sweep failed, depth exceeds a limit of fail_on, or a model is refused",
     EXIT_FAILED: "bad option, bad data or failed job",
     EXIT_INTERRUPTED: "interrupted",
     EXIT_SIGHUP: "ended by SIGHUP, e.g. a closed terminal",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import struct
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -342,8 +341,11 @@ def _read_nerfstudio(file: Path) -> SceneModel:
     def save(out: Path, similarity: Similarity) -> None:
         frames = []
         for view, entry in zip(views, entries, strict=True):
-            matrix = (similarity.move(view.c2w) @ _GL_FROM_CV).tolist()
-            frames.append({**entry, "transform_matrix": matrix, "file_path": _relative(folder / view.name, out)})
+            frames.append({**entry, "transform_matrix": (similarity.move(view.c2w) @ _GL_FROM_CV).tolist()})
+            for key in _FILE_KEYS:
+                if isinstance(entry.get(key), str):
+                    stored = files.resolve_inside(folder, entry[key], file, key)
+                    storage.copy_file(stored, files.resolve_inside(out, entry[key], file, key))
         kept = {key: value for key, value in meta.items() if key not in ("applied_transform", "applied_scale")}
         storage.write_json(out / file.name, {**kept, "ply_file_path": cloud.name, "frames": frames})
         _write_points(out / cloud.name, vertices, similarity)
@@ -353,9 +355,8 @@ def _read_nerfstudio(file: Path) -> SceneModel:
 
 _LENS_KEYS = ("cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
-
-def _relative(file: Path, folder: Path) -> str:
-    return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+#: Names of a frame's files, which are copied beside the written ``transforms.json``.
+_FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
 
 
 # -------------------------------------------------------------------------------------------------------------- splats

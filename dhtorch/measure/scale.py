@@ -95,7 +95,7 @@ _UNCLEAN = Flag.DEPTH_EDGE | Flag.BORDER
 class ScaleOptions:
     """How :func:`metric_scale` measures."""
 
-    n: int = 1200  # places in a picture that are compared
+    n: int = 800  # places in a picture that are compared
     max_frames: int = 60  # views compared at most, evenly spread
     candidates: int = 2  # frames tried for a view that is no frame's picture
     edge_rel: float = 0.1  # spread of the returns around a place from which it counts as an edge, left out
@@ -210,7 +210,9 @@ def metric_scale(
     columns = [np.concatenate(each) for each in zip(*(p[:4] for p in pairs), strict=True)] if pairs else []
     local = local_scales(index, *columns) if pairs else None
     if local is None or len(local.log) == 0:
-        raise ValueError(f"{model.root}: found too few sensor returns on the model's points, expected frames that see it")
+        raise ValueError(
+            f"{model.root}: found too few sensor returns on the model's points, expected frames that see it"
+        )
     mean, scatter, frame_log, frame_sigma = estimate_scale(local, len(used))
     view_names = [model.views[match.view].name for match in used]
     faults, gradients = find_faults(local, view_names, options.tolerance)

@@ -1,0 +1,189 @@
+"""``dhtorch scale``: a reconstruction up to scale and an RGB-D capture of the same scene -> the model in metres.
+
+Writes ``scale.json``, ``scale.html`` (scale of every frame, picture region and range) and, unless the model is refused,
+the files of the model with all lengths in metres. A model whose parts have different scales is refused with exit code 1.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch.data.io import decode as files
+from dhtorch.data.scene import scenes_of
+from dhtorch.measure.local_scales import REGIONS, ScaleTolerance
+from dhtorch.measure.models import Similarity, read_model, write_model
+from dhtorch.measure.scale import RANGE_SENSORS, ScaleOptions, ScaleResult, metric_scale
+from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import open_output_folder
+from dhtorch.viz.plots import Panel, fit_axis, save_figure
+from dhtorch.viz.plots.colours import FAINT, SERIES_COLOURS, Stroke
+from dhtorch.viz.viewer import validation as pages
+
+_COLUMNS = ("frame of the capture", "matched by", "scale", "difference", "sigma")
+_NOTE = "Bars are two standard deviations of the frame, the region or the range alone, without the sensor's own scale."
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any) -> int:
+    """Measure the scale of a model; returns the exit code, 1 where the model is refused.
+
+    Raises:
+        ValueError, OSError: bad options or data, or views that match no frame.
+    """
+    _check_options(settings)
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        files.set_opencv_threads(settings["threads"])
+    scenes = scenes_of(parts["data"])
+    if len(scenes) > 1:
+        raise ValueError(f"data: found {len(scenes)} recordings for one model, expected one (data.root=…)")
+    root = Path(str(settings["model"])).expanduser()
+    resolved = root.resolve()
+    out = Path(str(settings["out"] or resolved.with_name(f"{resolved.stem}_metres"))).expanduser()
+    if out.resolve() in (resolved, resolved.parent):
+        raise ValueError(f"out: found the model's own folder {out}, expected another one")
+    model = read_model(root, images=settings["images"])
+    recording = scenes[0].recording
+    options = ScaleOptions(max_frames=settings["max_frames"], tolerance=ScaleTolerance(settings["tolerance"]))
+    result = metric_scale(model, recording, sensor=settings["sensor"], cutoff=settings["cutoff"], options=options)
+    if settings["frame"] == "capture" and result.R is None:
+        raise ValueError("frame: found capture, expected model: the capture has no poses for the matched views")
+    plain = Similarity(result.scale, np.eye(3), np.zeros(3))
+    similarity = plain if settings["frame"] == "model" else result.similarity
+    with open_output_folder(out, "out"):
+        if result.ok:
+            write_model(model, out, similarity)
+        content = {"model": str(root), "format": model.format, "capture": recording.name, **describe_scale(result)}
+        storage.write_json(out / "scale.json", storage.to_strict_json(content))
+        _write_page(out / "scale.html", root.name, result)
+    for line in _format_lines(root, result):
+        print(line)
+    print(f"wrote {out}: {'the model in metres, ' if result.ok else ''}scale.json, scale.html")
+    return 0 if result.ok else 1
+
+
+def _check_options(settings: Mapping[str, Any]) -> None:
+    if settings["sensor"] not in RANGE_SENSORS:
+        raise ValueError(f"sensor: found {settings['sensor']!r}, expected one of {', '.join(RANGE_SENSORS)}")
+    if settings["frame"] not in ("model", "capture"):
+        raise ValueError(f"frame: found {settings['frame']!r}, expected model or capture")
+    if not (isinstance(settings["max_frames"], int) and settings["max_frames"] >= 1):
+        raise ValueError(f"max_frames: found {settings['max_frames']!r}, expected a whole number of at least 1")
+    for name in ("tolerance", "cutoff"):
+        if settings[name] is not None and not settings[name] > 0:
+            raise ValueError(f"{name}: found {settings[name]!r}, expected a positive number")
+
+
+def describe_scale(result: ScaleResult) -> dict[str, Any]:
+    """Result -> what ``scale.json`` holds."""
+    low, high = result.interval()
+    rows = zip(result.names, result.matches, result.frame_log, result.frame_sigma, strict=True)
+    return {
+        "refused": not result.ok,
+        "scale": result.scale,
+        "U": {"k": 2, "low": low, "high": high},
+        "sigma": {"relative": result.sigma, **result.terms},
+        "similarity": None if result.R is None else {"R": result.R, "t": result.t, "cov": result.cov},
+        "trajectory_scale": result.trajectory_scale,
+        "faults": [_describe_fault(fault) for fault in result.faults],
+        "gradients": [_describe_fault(gradient) for gradient in result.gradients],
+        "ranges": [dict(zip(("from", "to", "difference", "n"), row, strict=True)) for row in result.by_range],
+        "regions": [dict(zip(("row", "column", "difference", "sigma"), row, strict=True)) for row in _regions(result)],
+        "frames": [
+            {"view": name, "frame": m.frame, "same_picture": m.is_same, "scale": np.exp(log), "sigma": sigma}
+            for name, m, log, sigma in rows
+        ],
+        "notes": result.notes,
+    }
+
+
+def _describe_fault(fault: Any) -> dict[str, Any]:
+    return {"kind": fault.kind, "where": fault.where, "change": fault.change, "sigma": fault.sigma}
+
+
+def _regions(result: ScaleResult) -> list[tuple[int, int, float, float]]:
+    """(row, column, relative difference of scale, its sigma) of the picture regions."""
+    rows = []
+    for region in np.unique(result.local.region):
+        log = result.local.log[result.local.region == region] - np.log(result.scale)
+        sigma = 1.4826 * np.median(np.abs(log - np.median(log))) / np.sqrt(len(log))
+        rows.append((*divmod(int(region), REGIONS[1]), float(np.expm1(np.median(log))), float(sigma)))
+    return rows
+
+
+def _format_lines(root: Path, result: ScaleResult) -> list[str]:
+    """Printed sentences."""
+    half = 2 * result.sigma
+    terms = ", ".join(f"{name} {value:.2%}" for name, value in result.terms.items())
+    lines = [*(f"note: {note}" for note in result.notes)]
+    n = len(result.matches)
+    if result.faults:
+        lines += [f"{root.name}: refused. No single scale fits it ({n} views compared):"]
+        return lines + [f"  {fault}" for fault in _distinct(result.faults)]
+    lines += [f"{root.name}: 1 unit = {result.scale:.6g} m ± {half:.1%} (k = 2; {n} views; sigma: {terms})"]
+    if result.trajectory_scale is not None:
+        scale, sigma = result.trajectory_scale
+        lines += [f"  by the cameras' paths alone: {scale:.6g} m (scatter {sigma:.1%})"]
+    return lines
+
+
+def _distinct(faults: list[Any], most: int = 4) -> list[Any]:
+    """The clearest fault of each kind."""
+    first: dict[str, Any] = {}
+    for fault in faults:
+        first.setdefault(fault.kind, fault)
+    return list(first.values())[:most]
+
+
+def _write_page(path: Path, name: str, result: ScaleResult) -> None:
+    low, high = result.interval()
+    sentences = [f"1 unit of the model is {result.scale:.6g} m, from {low:.6g} to {high:.6g} m (k = 2).", *result.notes]
+    order = np.argsort(-np.abs(np.nan_to_num(result.frame_log - np.log(result.scale))))
+    frames = []
+    for k in order:
+        match, log = result.matches[k], float(result.frame_log[k])
+        how = "same picture" if match.is_same else "tracks"
+        difference = float(np.expm1(log - np.log(result.scale)))
+        cells = (str(match.frame), how, f"{np.exp(log):.5g}", f"{difference:+.2%}", f"{result.frame_sigma[k]:.2%}")
+        frames.append(pages.ValidatedFrame(result.names[k], cells))
+    plots = [pages.ValidatedFrame(title, (), png) for title, png in _plots(result)]
+    pages.write_validation_page(
+        path,
+        f"{name}: {'refused' if result.faults else 'metric scale'}",
+        sentences=sentences,
+        columns=_COLUMNS,
+        frames=[*plots, *frames],
+        failed=[str(fault) for fault in _distinct(result.faults)],
+        word="scale",
+        note=_NOTE,
+    )
+
+
+def _plots(result: ScaleResult) -> list[tuple[str, bytes]]:
+    """(title, PNG) of the differences of scale over frames, picture regions and range."""
+    centre = np.log(result.scale)
+    frames = [(k, float(v - centre), float(s)) for k, (v, s) in enumerate(zip(result.frame_log, result.frame_sigma))]
+    regions = [(k, change, sigma) for k, (_, _, change, sigma) in enumerate(_regions(result))]
+    ranges = [((a + b) / 2, change, 0.0) for a, b, change, _ in result.by_range]
+    shown = (("scale of every frame", "view, in the order of the capture", frames),)
+    shown += (("scale of every picture region", "region, row by row", regions), ("scale by range", "m", ranges))
+    return [(title, _plot(title, label, rows)) for title, label, rows in shown]
+
+
+def _plot(title: str, label: str, rows: list[tuple[float, float, float]]) -> bytes:
+    rows = [row for row in rows if np.isfinite(row[1])]
+    reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma, 0.0)]
+    x, y = fit_axis([row[0] for row in rows], label), fit_axis(reach, "difference, %", percent=True)
+    panel = Panel(title, x, y, size=(420, 216))
+    panel.line([x.low, x.high], [0.0, 0.0], Stroke(FAINT))
+    for at, value, sigma in rows:
+        panel.line([at, at], [value - 2 * sigma, value + 2 * sigma], Stroke(SERIES_COLOURS[0]))
+        panel.dot(at, value, Stroke(SERIES_COLOURS[0]))
+    buffer = io.BytesIO()
+    save_figure(panel.figure(), buffer)
+    return buffer.getvalue()

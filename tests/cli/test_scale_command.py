@@ -1,0 +1,75 @@
+"""``dhtorch scale``: the model in metres beside the original, and a bent one refused with exit code 1."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dhtorch.cli import run
+from dhtorch.measure import read_model
+from dhtorch.testing.layouts import write_counted_frames
+from tests.support import room_models as made
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "room"
+    write_counted_frames(folder, made.room_scene().frames)
+    return folder
+
+
+@pytest.fixture
+def model(tmp_path):
+    folder = tmp_path / "sparse"
+    content, true = made.room_model("points")
+    made.write_colmap_text(folder, content)
+    made.write_pictures(tmp_path / "images")
+    return folder, true
+
+
+def test_a_model_is_written_in_metres(capture, model, capsys):
+    folder, true = model
+    assert run.main(["scale", str(folder), str(capture), "--cutoff", "2.5"]) == 0
+    out = folder.with_name("sparse_metres")
+    report = json.loads((out / "scale.json").read_text())
+    assert not report["refused"] and abs(report["scale"] / true - 1) < 0.01
+    assert report["U"]["low"] < true < report["U"]["high"] and len(report["frames"]) == 12
+    before, after = read_model(folder), read_model(out)
+    np.testing.assert_allclose(after.xyz, report["scale"] * before.xyz, rtol=1e-6)
+    assert "1 unit = " in capsys.readouterr().out
+    assert (out / "scale.html").read_text().count("data:image/png;base64,") == 3
+
+
+def test_the_model_is_moved_into_the_world_of_the_capture(capture, model, tmp_path):
+    words = ["--cutoff", "2.5", "--frame", "capture", "--out", str(tmp_path / "out")]
+    assert run.main(["scale", str(model[0]), str(capture), *words]) == 0
+    poses = made.room_scene().poses
+    found = np.stack([view.c2w for view in read_model(tmp_path / "out").views])
+    np.testing.assert_allclose(found[:, :3, 3], poses[:, :3, 3], atol=0.05)
+
+
+def test_a_drifting_model_is_refused(capture, tmp_path, capsys):
+    content, _ = made.room_model("maps", "drift", 0.08)
+    made.write_arrays(tmp_path / "model", content)
+    made.write_pictures(tmp_path / "model" / "images")
+    assert run.main(["scale", str(tmp_path / "model"), str(capture), "--cutoff", "2.5"]) == run.EXIT_SOME_FAILED
+    out = tmp_path / "model_metres"
+    assert not (out / "predictions.npz").exists() and json.loads((out / "scale.json").read_text())["refused"]
+    printed = capsys.readouterr().out
+    assert "refused" in printed and "from 000000.png to 000011.png" in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--sensor", "sonar"], "sensor: found 'sonar', expected one of unknown"),
+        (["--frame", "sky"], "frame: found 'sky'"),
+        (["--out", "."], "out: found the model's own folder"),
+        (["--tolerance", "-1"], "tolerance: found -1"),
+    ],
+)
+def test_bad_options_are_one_line(capture, model, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(model[0])
+    assert run.main(["scale", str(model[0]), str(capture), "--max-frames", "3", *words]) == run.EXIT_FAILED
+    (line,) = [x for x in capsys.readouterr().err.strip().splitlines() if "assumed" not in x]
+    assert message in line

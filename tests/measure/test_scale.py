@@ -1,0 +1,101 @@
+"""The metric size of a model: right within its sigma, placed in the capture's world, refused where it is bent."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dhtorch.measure import ModelView, SceneModel, metric_scale
+from dhtorch.measure.local_scales import LocalScales, ScaleTolerance, estimate_scale, find_faults
+from tests.support import room_models as made
+
+
+def measure(model, **options):
+    scene = made.room_scene()
+    return metric_scale(model, scene.frames, names=[v.name for v in model.views], cutoff=made.NEAR, **options)
+
+
+@pytest.mark.parametrize("kind", ["maps", "points"])
+def test_the_scale_of_a_sound_model(kind):
+    model, true = made.room_model(kind)
+    result = measure(model)
+    assert result.ok and abs(result.scale / true - 1) < 0.01
+    low, high = result.interval()
+    assert low < true < high and set(result.terms) == {"frames", "sensor", "model"}
+
+
+@pytest.mark.parametrize("kind", ["maps", "points"])
+@pytest.mark.parametrize("fault", ["drift", "bend", "frames", "region"])
+def test_a_bent_model_is_refused_with_where_and_how_much(kind, fault):
+    model, _ = made.room_model(kind, fault, 0.08)
+    result = measure(model)
+    assert not result.ok and 0.03 < max(abs(f.change) for f in result.faults) < 0.2
+    along_the_recording = {"drift", "bend", "frames"}
+    assert {f.kind for f in result.faults} & (along_the_recording if fault != "region" else {"place"})
+
+
+def test_cameras_place_the_model_in_the_world_of_the_capture():
+    model, true = made.room_model("maps")
+    result = measure(model)
+    scene = made.room_scene()
+    moved = result.similarity.move(np.stack([v.c2w for v in model.views]))
+    np.testing.assert_allclose(moved[:, :3, :3], scene.poses[:, :3, :3], atol=5e-3)
+    np.testing.assert_allclose(moved[:, :3, 3], scene.poses[:, :3, 3], atol=0.03)
+    sigma = np.sqrt(np.diag(result.cov))
+    assert (np.linalg.eigvalsh(result.cov) > -1e-12).all() and sigma[6] == pytest.approx(result.sigma)
+    assert result.trajectory_scale[0] == pytest.approx(true, rel=0.03)
+
+
+def test_views_without_names_are_found_by_their_pictures(tmp_path):
+    made.write_pictures(tmp_path)
+    model, true = made.room_model("maps")
+    views = [replace(v, name=f"x{k}", image=tmp_path / f"{k:06d}.png") for k, v in enumerate(model.views)]
+    result = metric_scale(SceneModel(views), made.room_scene().frames, cutoff=made.NEAR)
+    assert all(m.is_same and m.view == m.frame for m in result.matches) and len(result.matches) == len(views)
+    assert abs(result.scale / true - 1) < 0.01
+
+
+def test_views_of_other_pictures_are_registered(tmp_path):
+    """Every second picture belongs to the model, the others are the capture's."""
+    made.write_pictures(tmp_path)
+    model, true = made.room_model("maps")
+    views = [replace(v, name=f"x{k}", image=tmp_path / f"{k:06d}.png") for k, v in enumerate(model.views)][::2]
+    result = metric_scale(SceneModel(views), made.room_scene().frames[1::2], cutoff=made.NEAR)
+    assert not any(m.is_same for m in result.matches) and len(result.matches) >= 3
+    assert abs(result.scale / true - 1) < 0.02
+
+
+def test_nothing_in_common_is_an_error():
+    model, _ = made.room_model("maps")
+    with pytest.raises(ValueError, match="no picture of the model and no view named"):
+        metric_scale(model, made.room_scene().frames, names=[f"y{k}" for k in range(12)])
+
+
+def test_a_view_of_another_aspect_ratio_is_compared_by_rays():
+    """A network's map of the middle of each picture."""
+    model, true = made.room_model("maps")
+    cut = [
+        ModelView(v.name, v.K - [[0, 0, 32], [0, 0, 0], [0, 0, 0]], (96, 64), v.c2w, depth=v.depth[:, 16:48])
+        for v in model.views
+    ]
+    assert abs(measure(SceneModel(cut)).scale / true - 1) < 0.01
+
+
+def synthetic(change=0.0, seed=0, F=24, noise=0.01):
+    draw = np.random.default_rng(seed)
+    frame, region = np.repeat(np.arange(F), 12), np.tile(np.arange(12), F)
+    log = noise * draw.normal(size=12 * F) + 0.004 * draw.normal(size=F)[frame] + change * frame / (F - 1)
+    depth, share = draw.uniform(1, 2, 12 * F), np.stack((region % 4 / 4 + 0.1, region // 4 / 3 + 0.1), 1)
+    return LocalScales(frame, region, log, np.full(12 * F, noise), depth, share, draw.normal(size=(12 * F, 3)))
+
+
+def test_sigma_and_refusals_of_drawn_local_scales():
+    """Sound: the mean is within two sigma as often as it should be and none is refused; 3 % of drift always is."""
+    names = [str(k) for k in range(24)]
+    drawn = [synthetic(seed=seed) for seed in range(60)]
+    estimates = [estimate_scale(local, 24)[:2] for local in drawn]
+    within = np.mean([abs(mean) <= 2 * sigma for mean, sigma in estimates])
+    assert within >= 0.85
+    assert np.mean([bool(find_faults(local, names)[0]) for local in drawn]) <= 0.02
+    assert all(find_faults(synthetic(0.03, seed), names)[0] for seed in range(20))
+    assert not find_faults(synthetic(0.03), names, ScaleTolerance(change=0.06))[0]
