@@ -64,6 +64,7 @@ EXPERIMENTS = {
     "align_study_unseen_2": "experiment=align_study data=synthetic_seeds data.seed=[20,21,22,23,24]",
     "align_study_unseen_3": "experiment=align_study data=synthetic_seeds "
     "data.seed=[45,46,47,48,49,50,51,52,53,54,55,56,57,58,59,60,61,62,63,64]",
+    "scale_study": "experiment=scale_study data=streams",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
     "room_phone": "experiment=opencv_twin data=synthetic_seeds",

@@ -1,7 +1,8 @@
 """``dhtorch scale``: a reconstruction up to scale and an RGB-D capture of the same scene -> the model in metres.
 
-Writes ``scale.json``, ``scale.html`` (scale of every frame, picture region and range) and, unless the model is refused,
-the files of the model with all lengths in metres. A model whose parts have different scales is refused with exit code 1.
+Writes ``scale.json``, ``scale.html`` (scale of every frame, picture region and range) and, unless the model is
+refused, the files of the model with all lengths in metres. A model whose parts have different scales is refused with
+exit code 1.
 """
 
 from __future__ import annotations
@@ -166,20 +167,22 @@ def _write_page(path: Path, name: str, result: ScaleResult) -> None:
 
 def _plots(result: ScaleResult) -> list[tuple[str, bytes]]:
     """(title, PNG) of the differences of scale over frames, picture regions and range."""
-    centre = np.log(result.scale)
-    frames = [(k, float(v - centre), float(s)) for k, (v, s) in enumerate(zip(result.frame_log, result.frame_sigma))]
-    regions = [(k, change, sigma) for k, (_, _, change, sigma) in enumerate(_regions(result))]
+    off = result.frame_log - np.log(result.scale)
+    frames = list(zip(map(float, range(len(off))), off.tolist(), result.frame_sigma.tolist(), strict=True))
+    regions = [(float(k), change, sigma) for k, (_, _, change, sigma) in enumerate(_regions(result))]
     ranges = [((a + b) / 2, change, 0.0) for a, b, change, _ in result.by_range]
-    shown = (("scale of every frame", "view, in the order of the capture", frames),)
-    shown += (("scale of every picture region", "region, row by row", regions), ("scale by range", "m", ranges))
-    return [(title, _plot(title, label, rows)) for title, label, rows in shown]
+    return [
+        ("scale of every frame", _plot("view, in the order of the capture", frames)),
+        ("scale of every picture region", _plot("region, row by row", regions)),
+        ("scale by range", _plot("m", ranges)),
+    ]
 
 
-def _plot(title: str, label: str, rows: list[tuple[float, float, float]]) -> bytes:
+def _plot(label: str, rows: list[tuple[float, float, float]]) -> bytes:
     rows = [row for row in rows if np.isfinite(row[1])]
     reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma, 0.0)]
     x, y = fit_axis([row[0] for row in rows], label), fit_axis(reach, "difference, %", percent=True)
-    panel = Panel(title, x, y, size=(420, 216))
+    panel = Panel("", x, y, size=(420, 216))
     panel.line([x.low, x.high], [0.0, 0.0], Stroke(FAINT))
     for at, value, sigma in rows:
         panel.line([at, at], [value - 2 * sigma, value + 2 * sigma], Stroke(SERIES_COLOURS[0]))

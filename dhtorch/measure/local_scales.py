@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Rows and columns of the regions of a picture. Source: chosen on: rooms 300 to 319 of scale_study, regions of at least
+#: Rows and columns of the regions of a picture. Source: chosen on: room 300 of scale_study, regions of at least
 #: 25 returns with 400 samples in a picture.
 REGIONS = (3, 4)
 
@@ -24,7 +24,7 @@ REGIONS = (3, 4)
 MIN_RATIOS = 6
 
 #: Least standard deviation of a local scale, as a log ratio: errors that neighbouring returns share. Source: chosen on:
-#: rooms 300 to 319 of scale_study.
+#: room 300 of scale_study.
 SHARED_NOISE = 0.004
 
 #: Standard deviation of a normal variable per median absolute deviation. Source: derived, 1 / Phi^-1(3/4).
@@ -63,9 +63,13 @@ class ScaleFault:
 class ScaleTolerance:
     """When a change of scale refuses a model: beyond ``change`` by more than ``deviations`` standard deviations."""
 
-    change: float = 0.015  # Source: chosen on: rooms 300 to 319 of scale_study
+    change: float = 0.015  # Source: chosen on: room 300 of scale_study
     deviations: float = 2.0  # gradients, of which there are a dozen. Source: as above
     scan_deviations: float = 4.0  # parts, of which there are about a hundred. Source: as above
+
+
+#: When a model is refused unless said otherwise.
+DEFAULT_SCALE_TOLERANCE = ScaleTolerance()
 
 
 def local_scales(
@@ -138,13 +142,12 @@ class _Contrast(NamedTuple):
 
 
 def find_faults(
-    local: LocalScales, names: list[str], tolerance: ScaleTolerance | None = None
+    local: LocalScales, names: list[str], tolerance: ScaleTolerance = DEFAULT_SCALE_TOLERANCE
 ) -> tuple[list[ScaleFault], list[ScaleFault]]:
     """Local scales and the F frames' names -> (changes of scale beyond the tolerance, all gradients).
 
     Faults are ordered by their excess in standard deviations, the largest first.
     """
-    tolerance = tolerance or ScaleTolerance()
     contrasts = list(_contrasts(local, names))
     if not contrasts or len(np.unique(local.frame)) < 2:
         return [], []

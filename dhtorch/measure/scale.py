@@ -11,6 +11,7 @@ poses, the rigid part of the similarity follows from the cameras; the size never
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.measure.local_scales import (
+    DEFAULT_SCALE_TOLERANCE,
     LocalScales,
     ScaleFault,
     ScaleTolerance,
@@ -100,7 +102,11 @@ class ScaleOptions:
     candidates: int = 2  # frames tried for a view that is no frame's picture
     edge_rel: float = 0.1  # spread of the returns around a place from which it counts as an edge, left out
     min_conf: int = 1  # of the sensor, 0 to 2
-    tolerance: ScaleTolerance = ScaleTolerance()
+    tolerance: ScaleTolerance = DEFAULT_SCALE_TOLERANCE
+
+
+#: The options of :func:`metric_scale` unless others are given.
+DEFAULT_SCALE_OPTIONS: Final = ScaleOptions()
 
 
 class ViewMatch(NamedTuple):
@@ -152,7 +158,7 @@ class ScaleResult:
         edges = np.quantile(self.local.depth, np.linspace(0, 1, 9))
         return [
             (float(a), float(b), float(np.expm1(np.median(self.local.log[here]) - np.log(self.scale))), int(here.sum()))
-            for a, b in zip(edges, edges[1:], strict=False)
+            for a, b in itertools.pairwise(edges)
             for here in [(self.local.depth >= a) & (self.local.depth <= b)]
             if here.any()
         ]
@@ -175,7 +181,7 @@ def metric_scale(
     names: Sequence[str] | None = None,
     sensor: str | RangeSensor = "unknown",
     cutoff: float | None = None,
-    options: ScaleOptions = ScaleOptions(),
+    options: ScaleOptions = DEFAULT_SCALE_OPTIONS,
 ) -> ScaleResult:
     """Model up to scale and RGB-D frames of the same scene -> metric scale with a standard deviation, or its faults.
 
@@ -319,8 +325,8 @@ def _match_by_content(
         image = model.views[k].image
         assert image is not None
         alike = of_frames @ _thumbnail(torch.from_numpy(read_image(image))[None])
-        best = alike.argsort(descending=True)[: options.candidates]
-        best = [chosen[int(i)] for i in best if alike[i] > _MIN_CORRELATION]
+        order = alike.argsort(descending=True)[: options.candidates].tolist()
+        best = [chosen[i] for i in order if alike[i] > _MIN_CORRELATION]
         same = [i for i in best if _is_same(model.views[k], frames[i])]
         matches += [ViewMatch(k, i, is_same=bool(same)) for i in (same[:1] or best[:1])]
     return sorted(matches, key=lambda m: m.frame)

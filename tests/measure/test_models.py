@@ -67,7 +67,7 @@ def test_a_model_is_written_after_a_similarity(tmp_path, kind, turned):
 
 
 def test_all_but_lengths_stays(tmp_path):
-    model, folder = write(tmp_path, "colmap bin")
+    _, folder = write(tmp_path, "colmap bin")
     write_model(read_model(folder), tmp_path / "out", Similarity(2.0, np.eye(3), np.zeros(3)))
     a, b = ((f / "points3D.bin").read_bytes() for f in (folder, tmp_path / "out"))
     size = 8 + 24 + 3 + 8 + 8 + 8
