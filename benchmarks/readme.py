@@ -562,6 +562,35 @@ def aligned(*results: str) -> str:
     return table(["number", *names, "bar"], rows)
 
 
+#: What the scale of a model is to reach, in words, and its bars.
+SCALED = {
+    "far_error": ("error at three times the near limit, mean over scenes of medians", "≤ 0.01"),
+    "error_without_sensor": ("error of scale, without the sensor's own", ""),
+    "within_sigma": ("scale within one sigma, sound models", ""),
+    "within_2sigma": ("within two", "≥ 0.92"),
+    "sound_refused": ("sound models refused", "≤ 0.02"),
+    "faulty_refused": ("models bent or drifting by 3 % or more refused", "≥ 0.95"),
+    **{
+        f"refused_{fault}_{size}": (f"of these: {words}, {float(size):.0%}", "")
+        for fault, words in (
+            ("drift", "drift along the recording"),
+            ("bend", "other scale in the middle"),
+            ("frames", "a quarter of the frames"),
+            ("range", "change over the sensor's range"),
+            ("region", "not of these: a sixth of the near scene"),
+        )
+        for size in ("0.03", "0.05", "0.1")
+    },
+}
+
+
+def scaled() -> str:
+    """What the scale of a model reaches, beside its bars."""
+    result = json.loads((RESULTS / "scale_study.json").read_text())["summary"]
+    rows = [[words, f"{result[f'scale.{name}']['value']:.3f}", bar] for name, (words, bar) in SCALED.items()]
+    return table(["number", "measured", "bar"], rows)
+
+
 def questions() -> str:
     """Every archived answer, in alphabetical order."""
     return verdicts(list(archived_answers()))
@@ -652,6 +681,7 @@ TABLES |= {
     "validate": validated,
     "validate real": validated_real,
     "lerobot train": lerobot_trained,
+    "scale": scaled,
     "align": partial(
         aligned,
         *("align_study", "align_study_streams", "align_study_rooms"),

@@ -158,8 +158,8 @@ def find_faults(
         ScaleFault(c.kind, c.where, float(np.expm1(d)), float(s))
         for c, d, s in zip(contrasts, change, sigma, strict=True)
     ]
-    found = [rows[k] for k in np.argsort(-excess) if excess[k] > 0]
-    return found, [row for row, c in zip(rows, contrasts, strict=True) if not c.is_part]
+    faults = [rows[k] for k in np.argsort(-excess) if excess[k] > 0]
+    return faults, [row for row, c in zip(rows, contrasts, strict=True) if not c.is_part]
 
 
 def _fit_contrasts(local: LocalScales, contrasts: list[_Contrast]) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ from dhtorch.data.codecs.npy import read_npz
 from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import check_memory
 from dhtorch.data.readers.colmap import COLMAP_LENSES, ColmapLens, make_colmap_lens, read_colmap_cameras
 from dhtorch.export.arrays import rotation_to_wxyz
 from dhtorch.runtime import storage
@@ -210,7 +211,7 @@ def _patch_text(data: bytes, numbers: Sequence[_Numbers]) -> bytes:
     lines = data.decode("utf-8").split("\n")
     for at, values in numbers:
         words = lines[at].split(maxsplit=len(values) + 1)
-        lines[at] = " ".join([words[0], *(f"{v:.10g}" for v in values), *words[len(values) + 1 :]])
+        lines[at] = " ".join([words[0], *(f"{v:.12g}" for v in values), *words[len(values) + 1 :]])
     return "\n".join(["# metres", *lines]).encode("utf-8")
 
 
@@ -390,19 +391,20 @@ def _write_points(file: Path, vertices: PlyVertices, similarity: Similarity) -> 
 
 def _read_splat(file: Path, pictures: Path | None) -> SceneModel:
     """Centres of opaque splats, and the cameras of ``cameras.json`` beside the PLY or up to two folders above it."""
-    found = [f / "cameras.json" for f in [file.parent, *file.resolve().parents[1:3]] if (f / "cameras.json").is_file()]
-    if not found:
+    places = [f / "cameras.json" for f in [file.parent, *file.resolve().parents[1:3]] if (f / "cameras.json").is_file()]
+    if not places:
         raise FormatError(file.parent, "cameras.json", "none beside or above the PLY", "the splat's cameras")
-    cameras = files.decode_json(files.read_text(found[0]), found[0])
+    source = places[0]
+    cameras = files.decode_json(files.read_text(source), source)
     vertices, views = _read_points(file), []
-    for k, entry in enumerate(files.get_entry({"cameras": cameras}, "cameras", list, found[0])):
+    for k, entry in enumerate(files.get_entry({"cameras": cameras}, "cameras", list, source)):
         values = entry if isinstance(entry, dict) else {}
-        w, h, fx, fy = (files.to_positive(values.get(n), found[0], f"{k}.{n}") for n in ("width", "height", "fx", "fy"))
+        w, h, fx, fy = (files.to_positive(values.get(n), source, f"{k}.{n}") for n in ("width", "height", "fx", "fy"))
         c2w = np.eye(4)
-        c2w[:3, :3] = files.to_array(values.get("rotation"), (3, 3), found[0], f"{k}.rotation")
-        c2w[:3, 3] = files.to_array(values.get("position"), (3,), found[0], f"{k}.position")
+        c2w[:3, :3] = files.to_array(values.get("rotation"), (3, 3), source, f"{k}.rotation")
+        c2w[:3, 3] = files.to_array(values.get("position"), (3,), source, f"{k}.position")
         name = str(values.get("img_name", k))
-        K, image = convert.make_K(fx, fy, w / 2 - 0.5, h / 2 - 0.5), _find_picture(found[0].parent, name, pictures)
+        K, image = convert.make_K(fx, fy, w / 2 - 0.5, h / 2 - 0.5), _find_picture(source.parent, name, pictures)
         views.append(ModelView(name, K, (round(h), round(w)), c2w, None, image))
     names = vertices.vertex.dtype.names or ()
     xyz = vertices.xyz[vertices.vertex["opacity"] > 0] if "opacity" in names else vertices.xyz
@@ -447,6 +449,8 @@ def _list_arrays(archive: Path) -> set[str]:
     check_zip_directory(io.BytesIO(data), archive)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as opened:
+            size = sum(member.file_size for member in opened.infolist())
+            check_memory(archive, "arrays", size, f"{size} bytes unpacked", len(data))
             return {name.removesuffix(".npy") for name in opened.namelist() if name.endswith(".npy")}
     except (zipfile.BadZipFile, ValueError) as error:
         raise FormatError(archive, "archive", error, "a whole .npz archive") from None
@@ -466,8 +470,8 @@ def _names_of_arrays(
     if n_archives > 1:
         return [archive.stem]
     folder = pictures if pictures is not None else (root if root.is_dir() else root.parent) / "images"
-    found = [file for file in folder.glob("*") if file.suffix in _IMAGE_SUFFIXES] if folder.is_dir() else []
-    return sorted(found, key=files.natural_sort_key) or None
+    present_files = [file for file in folder.glob("*") if file.suffix in _IMAGE_SUFFIXES] if folder.is_dir() else []
+    return sorted(present_files, key=files.natural_sort_key) or None
 
 
 def _views_of_arrays(

@@ -287,11 +287,11 @@ def _observed_points(
             point[j].append(n + np.nonzero(seen)[0])
             uv[j].append(at[seen] + 0.3 * draw.normal(size=(int(seen.sum()), 2)))
         n += len(there)
-    made = [
+    with_points = [
         ModelView(v.name, v.K, v.hw, v.c2w, v.distortion, point=np.concatenate(p), uv=np.concatenate(u))
         for v, p, u in zip(views, point, uv, strict=True)
     ]
-    return SceneModel(made, np.concatenate(xyz))
+    return SceneModel(with_points, np.concatenate(xyz))
 
 
 def _observed(scene: ScaleScene, j: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
