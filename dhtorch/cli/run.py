@@ -64,7 +64,7 @@ _POSITIONAL_OPTIONS = {
 }
 
 #: Sub-commands whose recordings are subsampled by ``every`` and ``max_frames`` before they run → whether by the latter.
-_SUBSAMPLED_COMMANDS = {"extract": True, "integrate": True, "stream": True, "view": False}
+_SUBSAMPLED_COMMANDS = {"extract": True, "integrate": True, "scale": False, "stream": True, "view": False}
 
 #: Sub-commands whose result is empty without sensor depth.
 _DEPTH_COMMANDS = ("align", "complete", "enrich", "integrate", "scale", "stream")

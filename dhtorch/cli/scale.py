@@ -71,6 +71,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
 def _check_options(settings: Mapping[str, Any]) -> None:
     if settings["sensor"] not in RANGE_SENSORS:
         raise ValueError(f"sensor: found {settings['sensor']!r}, expected one of {', '.join(RANGE_SENSORS)}")
+    if settings["device"] != "cpu":
+        raise ValueError(f"device: found {settings['device']!r}, expected cpu: the measurement is small")
     if settings["frame"] not in ("model", "capture"):
         raise ValueError(f"frame: found {settings['frame']!r}, expected model or capture")
     if not (isinstance(settings["max_frames"], int) and settings["max_frames"] >= 1):
