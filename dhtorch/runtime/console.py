@@ -138,7 +138,8 @@ def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress  # noqa: PLC0415
 
     columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}")
-    is_quiet, is_terminal = get_verbosity() == "quiet", sys.stderr.isatty()
+    is_quiet = get_verbosity() == "quiet"
+    is_terminal = sys.stderr.isatty()
     start = last_line = time.monotonic()
     bar_console = Console(file=unwrap_terminal(sys.stderr))
     with Progress(*columns, console=bar_console, disable=is_quiet or not is_terminal, transient=True) as bar:
