@@ -157,7 +157,7 @@ def test_the_folder_is_read_again_as_numbered_frames(captures, numbered):
 
 def test_figure_and_points_are_of_the_first_frame(room, numbered):
     files = [
-        p.relative_to(numbered).as_posix() for k in completed.EXTRA_FILES for p in sorted((numbered / k).iterdir())
+        p.relative_to(numbered).as_posix() for k in completed.EXTRA_FILES for p in sorted((numbered / k).glob("*"))
     ]
     assert files == ["figures/000000.png", "points/000000.glb", "points/000000.ply"]
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
