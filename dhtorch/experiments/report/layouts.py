@@ -350,6 +350,7 @@ EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "defocus_fusion": negatives.fusion_tables,
     "rh20t_probe": probes.future_motion_tables,
     "vo_probe": probes.visual_odometry_tables,
+    "downstream_probe": probes.downstream_tables,
 }
 #: Columns of these tables that the generic tables leave out.
 SHOWN_COLUMNS = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED_NUMBERS)

@@ -89,6 +89,22 @@ def visual_odometry_tables(result: Result) -> list[ReportTable]:
     return [ReportTable(title, heads, rows + cited, 2, quoted=len(cited), note=_note(result, table))]
 
 
+def downstream_tables(result: Result) -> list[ReportTable]:
+    """Table of the probe of enriched sets: one row per arm, for blocks and for streams held out."""
+    heads = ["held out", "arm", "samples", "error", "× context", INTERVAL_LABEL, "× sensor", INTERVAL_LABEL]
+    rows = []
+    for row in scene_rows(result):
+        cells = [row["scene"].removesuffix(" held out"), _label(result, row["method"])]
+        cells += [format_value(row["n_samples"], how="count"), _format_number(row.get("mse"))]
+        for name in ("vs_context", "vs_sensor"):
+            interval = {"low": row.get(f"{name}_low"), "high": row.get(f"{name}_high")}
+            cells += [_format_number(row.get(name)), _format_interval(interval)]
+        rows.append(cells)
+    title = "Next motion of the camera, from enriched sets; error in units of the targets' variance"
+    note = "" if _weights(result) else _RANDOM_WEIGHTS_NOTE
+    return [ReportTable(title, heads, rows, 2, note=note)]
+
+
 def _label(result: Result, arm: str) -> str:
     """Name of an arm, marked if DINOv2 has random weights."""
     return f"{arm} (random weights)" if "dinov2" in arm and not _weights(result) else arm
