@@ -79,7 +79,7 @@ def test_a_policy_learns_what_its_tokens_show():
     data = loop.Demonstrations(pixels, torch.zeros(n, 3), target, {"true": tokens, "rgb": blind})
     errors = []
     for condition in ("true", "rgb"):
-        policy = loop.clone_expert(data, condition, 0, epochs=15)
+        policy = loop.clone_expert(data, condition, 0, epochs=80)
         answer = policy(pixels, data.tokens[condition], data.position).detach()
         errors.append(float((answer - target).square().mean()))
     assert errors[0] < 0.4 * errors[1], errors
