@@ -119,7 +119,7 @@ def run(
     extract = partial(extract_features, readings=readings, networks=networks, settings=settings, cells=depth_cells)
     outcome = Outcome(metrics=PROBE_METRICS)
     samples = [(s, split_into_samples(s, gap_parts, blocks, min_samples)) for s in scenes_of(scenes)]
-    judged: dict[str, ProbeErrors] = {}
+    errors_by_split: dict[str, ProbeErrors] = {}
     with ProbeShards(features) as by_block, ProbeShards(features) as by_stream:
         for scene, scene_blocks in progress(samples, "enriched sets", len(samples)):
             for k, block in enumerate(scene_blocks):
@@ -130,13 +130,15 @@ def run(
                     shards.add(group, key, partial(_in_group, make, group))
         arms = {k: names for k, names in DOWNSTREAM_ARMS.items() if set(names) <= set(by_block.widths)}
         for name, shards in ((BLOCKS_OUT, by_block), (STREAMS_OUT, by_stream)):
-            judged[name] = probing.evaluate_probes(
+            errors_by_split[name] = probing.evaluate_probes(
                 shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed
             )
-            probing.record_probes(outcome, judged[name], name)
+            probing.record_probes(outcome, errors_by_split[name], name)
         outcome.n_pairs = by_block.n
-    outcome.summary = probing.summarise_probes(judged[BLOCKS_OUT])
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged[BLOCKS_OUT], judged[STREAMS_OUT], origin))
+    outcome.summary = probing.summarise_probes(errors_by_split[BLOCKS_OUT])
+    return outcome.decide(
+        QUESTION, EXPECTATION, *verdict(errors_by_split[BLOCKS_OUT], errors_by_split[STREAMS_OUT], origin)
+    )
 
 
 def split_into_samples(scene: Scene, gap_parts: int, blocks: int, min_samples: int) -> list[list[tuple[int, int, int]]]:
@@ -188,8 +190,8 @@ def read_again(recording: Recording, options: Mapping[str, Any]) -> Recording:
         ValueError: no LeRobot set on disk.
     """
     if recording.format != "lerobot" or recording.root is None:
-        found = f"{recording.name} is {recording.format}"
-        raise ValueError(f"downstream_probe: {found}, expected a LeRobot set that dhtorch enrich wrote")
+        actual = f"{recording.name} is {recording.format}"
+        raise ValueError(f"downstream_probe: {actual}, expected a LeRobot set that dhtorch enrich wrote")
     again = data.open_all(recording.root, "lerobot", **options)
     return next(r for r in again if r.name == recording.name)
 
