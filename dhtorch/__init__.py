@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dhtorch.transforms import ExtendDepth, ValidateDepth
     from dhtorch.validation.validate import validate_depth
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AUTO",

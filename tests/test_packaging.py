@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+import dhtorch
+
 REPO = Path(__file__).resolve().parents[1]
 PACKAGE = REPO / "dhtorch"
 TINY = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "pairs.gap=2", "method.n=256"]
@@ -67,6 +69,29 @@ def test_the_wheel_says_what_it_is(wheel):
     assert "dhtorch = dhtorch.cli.run:main" in entry
 
 
+def test_urls_and_links_are_those_of_the_repository_that_builds(tmp_path, monkeypatch):
+    """Without GitHub's variables there are no URLs, and README keeps its links."""
+    monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
+    with zipfile.ZipFile(build(REPO, "wheel", tmp_path)) as archive:
+        (plain,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+    assert "Project-URL" not in plain and "](docs/assets/triptych.jpg)" in plain
+    monkeypatch.setenv("GITHUB_REPOSITORY", "owner/dhtorch")
+    with zipfile.ZipFile(build(REPO, "wheel", tmp_path)) as archive:
+        (facts,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+    named = dict(line.split(", ") for line in re.findall(r"^Project-URL: (.*)$", facts, re.M))
+    assert set(named) == {"Homepage", "Documentation", "Changelog", "Issues"}
+    assert named["Homepage"] == "https://github.com/owner/dhtorch"
+    assert "](https://github.com/owner/dhtorch/raw/main/docs/assets/triptych.jpg)" in facts
+    assert not re.findall(r"\]\((?!https?:|#)", facts)
+
+
+def test_the_version_stands_in_one_place():
+    """Citation and changes name the version of the package."""
+    (citation,) = re.findall(r"^version: (.*)$", (REPO / "CITATION.cff").read_text(encoding="utf-8"), re.M)
+    headings = re.findall(r"^## (.*)$", (REPO / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    assert citation == headings[0] == dhtorch.__version__
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
 def test_the_wheel_works_where_no_checkout_is(wheel, tmp_path):
@@ -116,7 +141,16 @@ def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
     (source,) = (p for p in tmp_path.iterdir() if p.is_dir())
     for name in ("tests", "benchmarks", "notebooks", "docs", "conf"):
         assert (source / name).is_dir(), name
-    for name in ("README.md", "LICENSE", "CITATION.cff", "Makefile", "constraints.txt", "mkdocs.yml", "pyproject.toml"):
+    for name in (
+        "README.md",
+        "LICENSE",
+        "CITATION.cff",
+        "Makefile",
+        "constraints.txt",
+        "mkdocs.yml",
+        "pyproject.toml",
+        "hatch_build.py",
+    ):
         assert (source / name).is_file(), name
     again = build(source, "wheel", tmp_path)
     assert again.name == wheel.name and members(again) == members(wheel)
