@@ -50,11 +50,10 @@ _QUESTION = re.compile(
 
 
 def on_config(config: Any) -> Any:
-    """The API's pages and the notebooks join the navigation; the repository is where this clone came from."""
+    """Notebooks follow the tutorials, the API's pages the results; the repository is where this clone came from."""
     config.repo_url = config.repo_url or origin()
     config.nav.insert(2, {"Notebooks": [{notebook_title(n): f"notebooks/{n.stem}.md"} for n in notebooks()]})
-    pages = [{"dhtorch": "api/dhtorch.md"}, *({part: f"api/{part}.md"} for part in parts())]
-    config.nav.insert(len(config.nav) - 1, {"API": pages})
+    config.nav.append({"API": [{"dhtorch": "api/dhtorch.md"}, *({part: f"api/{part}.md"} for part in parts())]})
     return config
 
 

@@ -116,7 +116,7 @@ def _read_pixel_type(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobo
 
 
 def find_depth_feature(meta: LeRobotMeta, camera: str, requested: str | None) -> LeRobotFeature | None:
-    """The depth feature of a camera: the one ``requested`` for, named like the camera, or the only one; else None."""
+    """The depth feature of a camera: as ``requested``, named like the camera, enriched, or the only one; else None."""
     depths = {key: f for key, f in meta.features.items() if f.is_depth and len(f.shape) >= 2}
     if requested is not None:
         if requested not in meta.features or len(meta.features[requested].shape) < 2:
@@ -125,6 +125,8 @@ def find_depth_feature(meta: LeRobotMeta, camera: str, requested: str | None) ->
     matching = [f for key, f in depths.items() if _distinctive_words(key) == _distinctive_words(camera)]
     if len(matching) == 1:
         return matching[0]
+    if (enriched := f"{camera}_depth_enriched") in depths:  # by dhtorch enrich, of a source with a depth video
+        return depths[enriched]
     return next(iter(depths.values())) if len(depths) == 1 and len(select_colour_keys(meta)) == 1 else None
 
 
