@@ -170,7 +170,7 @@ def chosen_views(*results: str) -> str:
 
 
 def beside_chosen() -> str:
-    """What choosing views is worth beside every fixed gap, what it must not do, and what it costs."""
+    """View selection beside every fixed gap: coverage, false answers, cost."""
     study, stress = (
         json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in ("views_study", "stress")
     )
@@ -178,8 +178,8 @@ def beside_chosen() -> str:
     worst, turned, wrong = (s[f"auto.{n}"]["value"] for s, n in zip((study, study, stress), BESIDE, strict=True))
     rows = [
         ["coverage at 5 % risk over that of the best fixed gap, worst scene", number(worst), "≥ 0.9"],
-        ["samples without a return that are answered where the camera only turns", percent(turned), "≤ 0.5 %"],
-        ["answered and wrong by a fifth where what is near moves, worst room", percent(wrong), "≤ 1 %"],
+        ["coverage of samples without a return where the camera only rotates", percent(turned), "≤ 0.5 %"],
+        ["answers off by more than 20 % where near objects move, worst room", percent(wrong), "≤ 1 %"],
         ["time of a whole reference view, ratio to `window`", number(timed["auto_reference_view"]), "≤ 1.0"],
         ["time of `Stream.push`, ratio to OpenCV's stages on the same views", number(timed["stream_push"]), "≤ 1.2"],
     ]
@@ -217,7 +217,7 @@ def pixels_by_scene(comparison: str) -> str:
         cells += [number(own.get("ause_ratio")), number(own.get("error_ratio_to_sparse"))]
         peers = (own.get(f"error_ratio_to_{peer}") for peer in ("sgbm", "dis_flow", "bilateral"))
         rows.append([*cells, " / ".join("–" if ratio is None else number(ratio) for ratio in peers)])
-    head = ["scene", "answered", "median error", "off by a fifth", "AUSE", "error to sparse"]
+    head = ["scene", "coverage", "median error", "off by more than 20 %", "AUSE", "error to sparse"]
     return table([*head, "to SGBM / DIS / bilateral"], rows)
 
 
@@ -437,8 +437,8 @@ def number_as(value: float, key: str) -> str:
 
 #: Columns of a sweep's table, and which end of each is the better one.
 SWEPT: dict[str, Any] = {"coverage": max, "median_rel": min, "p90_rel": min, "coverage_at_5": max, "ms": min}
-HEAD = {"coverage": "answered", "median_rel": "median error", "p90_rel": "p90"}
-HEAD |= {"coverage_at_5": "answered at 5 % mean error", "ms": "ms"}
+HEAD = {"coverage": "coverage", "median_rel": "median error", "p90_rel": "p90 error"}
+HEAD |= {"coverage_at_5": "coverage at 5 % risk", "ms": "ms"}
 
 
 def captures() -> str:
@@ -496,23 +496,23 @@ def enriched() -> str:
 
 #: What validation is to find, in words, and its bars.
 SCALE_ROWS = {
-    "scale_detected": ("metre off by a tenth: found, reference views with a baseline", "≥ 0.95"),
-    "scale_detected_5": ("metre off by a twentieth: found", "≥ 0.90"),
-    "false_alarm": ("sound maps whose metre is called wrong", "≤ 0.02"),
+    "scale_detected": ("scale off by a tenth: detected, reference views with a baseline", "≥ 0.95"),
+    "scale_detected_5": ("scale off by a twentieth: detected", "≥ 0.90"),
+    "false_alarm": ("correct maps whose scale is called wrong", "≤ 0.02"),
     "scale_detected_far": ("a tenth, by triangulated points alone", ""),
     "scale_detected_5_far": ("a twentieth, by triangulated points alone", ""),
     "false_alarm_far": ("false alarms of triangulated points alone", ""),
     "jump_auroc": (
-        "surfaces moved to three times their depth, where no return is shown: area under the curve",
+        "surfaces moved to three times their depth, without a return: area under the ROC curve",
         "≥ 0.95",
     ),
-    "called_right_wrong": ("pixels called consistent that are a fifth off", "≤ 0.01"),
+    "called_right_wrong": ("pixels called consistent that are off by 20 %", "≤ 0.01"),
     "called_right_wrong_worst": ("the same in the worst scene", ""),
-    "called_right_wrong_cut": ("the same of maps that are cut at the depth that six in ten pixels are nearer than", ""),
-    "called_wrong_right": ("pixels of sound maps called wrong, of those validated", ""),
-    "known": ("pixels of sound maps of which something is said", ""),
+    "called_right_wrong_cut": ("the same of maps clipped at the 60th percentile of depth", ""),
+    "called_wrong_right": ("pixels of correct maps called wrong, of those validated", ""),
+    "known": ("pixels of correct maps that are not unknown", ""),
     "named_worst": ("cause named, worst kind, windows moved by two pixels", "≥ 0.90"),
-    "misnamed": ("cause named in sound windows", ""),
+    "misnamed": ("cause named in windows without a fault", ""),
 }
 
 
@@ -550,24 +550,24 @@ def validated() -> str:
 
 
 def named_registration(rows: list[dict[str, Any]]) -> str:
-    """Of the windows in which the depth is not registered, in how many that was named."""
+    """Of the windows in which the depth is not registered, the number in which that cause was named."""
     names = [row["named_kind"] for row in rows if row.get("planted_kind") == "registration"]
     return f"{names.count('registration')} of {len(names)}"
 
 
 def validated_real() -> str:
-    """What is said of real sensors' own depth."""
+    """Validation of real sensors' own depth."""
     rows = []
     for row in json.loads((RESULTS / "validate_real.json").read_text()):
         whole, limited = row["whole"], row["whole"]["limited"]
         wrong = (
-            "nothing is known" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
+            "unknown" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
         )
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
         options = f" {' '.join(row['options'])}" if row["options"] else ""
         cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{limited['unknown']:.1%}"]
         rows.append([*cells, causes or ("no window" if not whole["windows"] else "none")])
-    return table(["capture", "frames", "wrong, of what is known", "cannot be known", "likely cause (windows)"], rows)
+    return table(["capture", "frames", "wrong, of validated pixels", "unknown", "likely cause (windows)"], rows)
 
 
 #: What alignment is to reach, in words, and its bars.
@@ -575,7 +575,7 @@ ALIGNED = {
     "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
     "ratio_to_near_affine": ("far error, ratio to an affine fit to near returns, median over faults", "≤ 0.5"),
     "worst_ratio_to_better": ("worst scene and fault: (error − 0.002) / the better of raw and near-only", "≤ 1.05"),
-    "within_sigma": ("within one sigma, all pixels with truth", "0.68 ± 0.07"),
+    "within_sigma": ("within one sigma, all pixels with ground truth", "0.68 ± 0.07"),
     "within_2sigma": ("within two", "≥ 0.90"),
 }
 
@@ -676,7 +676,7 @@ def faults_of_captures() -> str:
             "named",
             "other warning",
             "stated as unchecked",
-            "silent",
+            "not detected",
             "false alarm",
         ],
         cells,
@@ -756,7 +756,7 @@ GAINS = {
     "coverage_at_5_indoor": ("coverage at 5 % mean risk, mean over indoor scenes", "≥ 0.50 (streams 0.62)"),
     "error_ratio_to_auto_2": ("median error at equal coverage, ratio to `auto_2`", "≤ 1.0"),
     "worst_scene_ratio_to_auto_2": ("the same, worst scene", "≤ 1.1"),
-    "aurc_full_ratio_to_auto_2": ("area under risk–coverage with silence as 1, ratio to `auto_2`", "≤ 1.0"),
+    "aurc_full_ratio_to_auto_2": ("area under risk–coverage with unanswered as risk 1, ratio to `auto_2`", "≤ 1.0"),
     "within_sigma": ("errors within one stated sigma", "0.68 ± 0.05"),
     "within_2sigma": ("errors within two", "≥ 0.92"),
     "ece_scenes": ("calibration error beyond chance, mean over scenes", "≤ 0.05"),
@@ -774,14 +774,14 @@ PIXELS = {
     "dense.ause_ratio": ("area between sparsification and the errors' own order, over that of chance", "≤ 0.5"),
     "dense.within_sigma": ("errors within one sigma, calibrated in other rooms", "0.68 ± 0.07"),
     "dense.within_2sigma": ("errors within two", "≥ 0.90"),
-    "dense.wrong_share": ("answered pixels off by a fifth, mean over scenes", "≤ 0.05"),
+    "dense.wrong_share": ("answered pixels off by more than 20 %, mean over scenes", "≤ 0.05"),
     "dense.error_ratio_to_sgbm": ("error at equal coverage with one other view, ratio to rectified SGBM", "≤ 1.0"),
     "dense.error_ratio_to_sgbm_own_calibration": ("the same, SGBM under the data set's own calibration", ""),
     "dense.error_ratio_to_dis_flow": ("the same, DIS flow triangulated", ""),
     "dense.error_ratio_to_bilateral": ("the same, the sensor filled by a joint bilateral filter", ""),
-    "dense.rotation_answered": ("pixels answered where the camera only turns", "≤ 0.003"),
+    "dense.rotation_answered": ("pixels answered where the camera only rotates", "≤ 0.003"),
     "dense.room_within_1": ("built-in rooms, exact motion: answered pixels within 1 %", "≥ 0.90"),
-    "dense.room_within_1_of_all": ("the same of all that was asked, silence counted as a miss", ""),
+    "dense.room_within_1_of_all": ("the same of all pixels, unanswered ones counted as misses", ""),
 }
 
 BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}

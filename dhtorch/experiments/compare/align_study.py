@@ -1,5 +1,4 @@
-"""Question: does a map of anybody's become as metric as our reference views allow, and is it left alone where it is
-right?
+"""Question: does alignment make any depth map as metric as the references allow, and leave a correct map unchanged?
 
 The true map of a frame is distorted in controlled ways, aligned to the frame's near returns and far answers, and
 compared with the truth beyond the near limit. Faults in shape and scale like a network's enter the ratio; faults of

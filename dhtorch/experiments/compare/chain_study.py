@@ -1,4 +1,4 @@
-"""Question: do tracks through the frames between the two of a pair answer more than one jump, without more error?
+"""Question: do tracks through the frames between a pair raise the coverage over one jump, without more error?
 
 Expectation (written before the run): over the video scenes ``paper`` with tracks through up to four frames between has
 at least 1.5 times the coverage of ``paper_direct``, at a median error of at most 1.15 of its own; ``kornia``, with the

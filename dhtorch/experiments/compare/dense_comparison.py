@@ -1,4 +1,4 @@
-"""Question: can every far pixel have a depth that is as good as a sparse answer, and say where it is not?
+"""Question: can every far pixel have a depth as accurate as a sparse answer, or else no answer?
 
 Expectation (written before the run): a sweep under the sparse method's motions answers at least half of the hidden
 pixels, with or without texture; where sparse answers as well its median error is at most 1.15 times theirs; on the

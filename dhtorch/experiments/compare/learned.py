@@ -1,4 +1,4 @@
-"""Question: what do feed-forward networks give on the same points, once somebody tells them the scale?
+"""Question: how accurate are feed-forward networks on the same points, given the scale?
 
 DUSt3R and VGGT estimate dense depth up to scale. For the comparison with our metric depth the scale is (a) an oracle's:
 the median ratio to the truth over pixels of the reference view that no sample reads, one scale for each pair, as in the

@@ -1,4 +1,4 @@
-"""Question: is ``map`` more accurate than ``paper``, and does it know what it does not know?
+"""Question: is ``map`` more accurate than ``paper``, and are its sigma and score calibrated?
 
 Expectation (written before the run): over the scenes the median error falls to at most 0.7 of the paper's (``window``:
 0.6), no scene is more than 15 % worse at equal coverage, the area under the risk–coverage curve falls to 0.65 (0.55),

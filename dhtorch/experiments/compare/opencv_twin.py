@@ -1,4 +1,4 @@
-"""Question: does the batched torch pipeline give what the same seats filled by OpenCV give, scene by scene?
+"""Question: does the batched torch pipeline give the same results as the same stages by OpenCV, scene by scene?
 
 Expectation (written before the run): yes; on every scene, median error and coverage of ``paper`` lie within 10 % of
 those of ``opencv``, because the formulas are the same and only the minimal solver (P3P for EPnP) differs. Where few

@@ -1,4 +1,4 @@
-"""Question: which part of a method carries its gain over the one before it, and what does each cost?
+"""Question: which parts account for a method's gain over the one before it, and what does each cost?
 
 Expectation (written before the run): the parts need each other. Of ``map``, put in the paper's place alone, far tracks
 in the pose gain most and a registration of tracks gains little; gates and scores change what is answered, not how well;

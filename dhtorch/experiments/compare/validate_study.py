@@ -1,4 +1,4 @@
-"""Question: does the judge find what is wrong with a depth map, and keep silent where nothing can tell?
+"""Question: does validation detect the errors of a depth map, and report unknown where there is no evidence?
 
 Expectation (written before the run): a metre that is wrong by a tenth is found in 95 % of the pairs with a baseline, at
 2 % false alarms; objects that stand elsewhere are told from the rest with an area under the curve of .95 where

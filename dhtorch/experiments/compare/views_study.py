@@ -1,4 +1,4 @@
-"""Question: does a method that chooses its views reach the best fixed gap, and is it silent without a baseline?
+"""Question: does view selection reach the best fixed gap, and does it abstain without a baseline?
 
 Expectation (written before the run): yes; on every scene whose reference views have several source views ``auto``
 answers, at 5 % mean risk, at least nineteen twentieths of what ``map`` answers at the gap that is the best of that

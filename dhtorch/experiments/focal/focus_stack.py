@@ -1,4 +1,4 @@
-"""Question: does the classical recipe, the sharpest picture of every pixel, read depth off a focal stack?
+"""Question: does the classical method, the sharpest picture of every pixel, recover depth from a focal stack?
 
 On scenes of exact depth the stack is rendered through a thin lens, in five conditions: ``clean``; ``noisy`` (4 grey
 levels); ``moved`` (breathing by 2 % and a hand's shifts of about a pixel) and ``aligned`` (the same after alignment);

@@ -1,4 +1,4 @@
-"""Question: does correlating the two spiral signals in time squeeze out parallax?
+"""Question: does the correlation of the two spiral signals in time measure parallax?
 
 Each of the two phase-shifted arms is a 1-D signal; when the camera moves, near points shift further along it than far
 ones, so the size of the shift is a depth cue. It is measured as the shift of an arm's signal against itself

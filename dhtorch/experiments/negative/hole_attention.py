@@ -1,4 +1,4 @@
-"""Question: does looking at the holes fill them?
+"""Question: does denser sampling at the holes fill them?
 
 Hypothesis: holes are sampled too sparsely, so the gaze moves onto the largest cluster of holes and the frame is sampled
 again (``attention``). It is compared with the original gaze (``centre``), a random gaze (``random``) and evenly spread

@@ -1,4 +1,4 @@
-"""Question: which part of the method does the result hang on?
+"""Question: which part of the method determines the result?
 
 Expectation (written before the run): the sampler hardly matters (any even-handed pattern does), coverage does not
 depend on the number of samples, the tracking window matters little between 15 and 31 px, and no single change of a

@@ -1,4 +1,4 @@
-"""Question: does fusing recovered points into one map widen it, and do they stitch its fragments into one?
+"""Question: does fusing recovered points into one map extend it, and do they connect its fragments?
 
 Returns beyond the scene's cutoff are hidden. The remaining returns alone, and together with recovered points, are each
 fused into a signed distance field along the recording's own poses (``device``) and along chained poses of the method

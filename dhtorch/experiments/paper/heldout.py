@@ -1,4 +1,4 @@
-"""Question: when the pose never sees the points it is judged by, how good is triangulated depth, scene by scene?
+"""Question: how accurate is triangulated depth, scene by scene, at points that the pose was not fitted to?
 
 Expectation (written before the run; the refutation was made stricter after it, as the paper has it): the hold-out error
 is well above that of the naive protocol, which judges the pose by the inliers it was fitted to (the paper: 3.5 against

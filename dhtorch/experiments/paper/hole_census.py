@@ -1,4 +1,4 @@
-"""Question: are most of the sensor's holes places where the picture could still be tracked?
+"""Question: are most of the sensor's holes trackable in the picture?
 
 Expectation (written before the run): yes; most holes are TRACKABLE_NO_LIDAR (the paper: 90.4 % indoors, 86.1 %
 outdoors), and their trackability is of the same order as that of samples with a return.

@@ -1,4 +1,4 @@
-"""Question: can near returns alone recover far depth, and is it the anchored pose that does it?
+"""Question: can near returns alone recover far depth, and is the pose from near returns the cause?
 
 Expectation (written before the run): with returns beyond the cutoff hidden, the anchored pose answers most far
 candidates with an error of a few to some ten per cent; triangulation from the device's own trajectory is not usable;

@@ -1,4 +1,4 @@
-"""Question: are the sensor's real holes recovered as well as returns that were merely hidden?
+"""Question: are the sensor's real holes recovered as well as hidden returns?
 
 Expectation (written before the run): no; real drop-outs lie at edges, on dark, shiny and distant surfaces, so on the
 median scene their error is larger, and some scenes have no answer at all.

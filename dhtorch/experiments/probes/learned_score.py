@@ -1,4 +1,4 @@
-"""Question: does a score learnt from errors order answers better, in rooms it has not seen, than those made by hand?
+"""Question: does a score trained on errors rank answers better than the analytic ones, in rooms not trained on?
 
 Expectation (written after the scorer was designed on rooms of the synthetic data set): over scenes, the geometric mean
 of the area under the risk–coverage curve lies below that of the paper's score and below that of

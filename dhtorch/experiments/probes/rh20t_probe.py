@@ -1,4 +1,4 @@
-"""Question: do depth features tell a ridge probe as much of a robot's next motion as DINOv2's do?
+"""Question: do depth features predict a robot's next motion as well as DINOv2's in a ridge probe?
 
 Samples are frames of the wrist camera. The target is the pose of the hand after ``horizon``, in its present axes:
 translation and rotation vector. The context, shared by all arms, is the robot's state, which needs no image: pose,

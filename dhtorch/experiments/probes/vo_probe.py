@@ -1,4 +1,4 @@
-"""Question: within one scene, do depth features tell a ridge probe more of the camera's own motion than DINOv2's do?
+"""Question: within one scene, do depth features predict the camera's motion better than DINOv2's in a ridge probe?
 
 Samples are pairs of frames, a third of the scene's usable gap apart; the target is how the camera moved between them,
 rotation vector and translation from the recording's own trajectory. The input of the probe is the features of the
