@@ -169,18 +169,22 @@ def _public_table(package: ModuleType) -> list[str]:
     """``__all__`` of a package as a table: each name, linked to where it is described, and its first sentence."""
     values = [(name, getattr(package, name)) for name in package.__all__]
     names = [(n, x) for n, x in values if callable(x) or isinstance(x, ModuleType)]  # constants stand with their module
-    return [*_TABLE_HEAD, *(f"| [`{n}`][{_home(n, x)}] | {_first(x.__doc__)} |" for n, x in names)]
+    return [*_TABLE_HEAD, *(f"| [`{n}`][{_home(package, n, x)}] | {_first(x.__doc__)} |" for n, x in names)]
 
 
-def _home(name: str, value: Any) -> str:
+def _home(package: ModuleType, name: str, value: Any) -> str:
     """The dotted name under which a public name is described."""
     if isinstance(value, ModuleType):
         return value.__name__
-    return (
-        f"dhtorch.pipeline.presets.{name}"
-        if isinstance(value, dhtorch.Method)
-        else f"{value.__module__}.{value.__qualname__}"
-    )
+    if isinstance(value, dhtorch.Method):
+        return f"{_imported_from(package, name)}.{name}"
+    return f"{value.__module__}.{value.__qualname__}"
+
+
+def _imported_from(package: ModuleType, name: str) -> str:
+    """The module from which the ``__init__`` of a package imports a name."""
+    imports = (node for node in ast.walk(_tree(Path(str(package.__file__)))) if isinstance(node, ast.ImportFrom))
+    return next(str(node.module) for node in imports if name in {alias.name for alias in node.names})
 
 
 def _module(file: Path) -> str:

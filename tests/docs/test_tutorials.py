@@ -22,7 +22,9 @@ MADE = {
 
 def blocks(page):
     """(language, text) of the blocks of a page that run."""
-    return re.findall(r"^```(python|bash)\n(.*?)^```", (TUTORIALS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
+    return re.findall(
+        r"^```(python|bash)\n(.*?)^```", (TUTORIALS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S
+    )
 
 
 def expected_code(line):
@@ -57,6 +59,8 @@ def test_a_tutorial_works_as_it_is_written(page, tmp_path, monkeypatch, capsys):
         share = [float((names[name][2].depth > 0).float().mean()) for name in ("sensor", "completed")]
         assert share[1] > share[0] + 0.1, "depth beyond the sensor"
     if page == "phone_scan":
-        shown = re.search(r"^```text\n(.*?)^```", (TUTORIALS / "phone_scan.md").read_text(encoding="utf-8"), re.M | re.S)
+        shown = re.search(
+            r"^```text\n(.*?)^```", (TUTORIALS / "phone_scan.md").read_text(encoding="utf-8"), re.M | re.S
+        )
         for line in shown[1].strip().splitlines():
             assert re.sub(r"[\d.,]+", "N", line) in printed, line

@@ -56,7 +56,7 @@ _METRICS = (
     MainMetric("within_2sigma", larger_is_better=None),
 )
 
-QUESTION = "Does anybody's map become as metric as the reference views allow, and is it left alone where it is right?"
+QUESTION = "Does alignment make any depth map as metric as the references allow, and leave a correct map unchanged?"
 EXPECTATION = "Every number of the list of bars is met; scenes are the unit."
 
 #: Number → (bar, whether it holds).

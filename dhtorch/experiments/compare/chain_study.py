@@ -19,7 +19,7 @@ from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, 
 from dhtorch.metrics.errors import Points
 from dhtorch.stages.track_chain import track_chain
 
-QUESTION = "Do tracks through the frames between the two of a pair answer more than one jump, without more error?"
+QUESTION = "Do tracks through the frames between a pair raise the coverage over one jump, without more error?"
 EXPECTATION = (
     "paper has at least 1.5 times the coverage of paper_direct at 1.15 of its error at most; kornia has .9 to 1.1 of "
     "the coverage of paper and .9 to 1.15 of its error."

@@ -39,7 +39,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import DepthMap, Estimate, Frame, Pose, Samples
 
-QUESTION = "Can every far pixel have a depth as good as a sparse answer, and say where it is not?"
+QUESTION = "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?"
 EXPECTATION = (
     "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
 )

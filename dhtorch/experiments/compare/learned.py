@@ -45,7 +45,7 @@ from dhtorch.pipeline.spec import Trace
 from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate, Frame, Pose
 
-QUESTION = "What do feed-forward networks give on the same points, once somebody tells them the scale?"
+QUESTION = "How accurate are feed-forward networks on the same points, given the scale?"
 EXPECTATION = (
     "With an oracle's scale VGGT has a smaller median error than ours on most scenes, on the points ours answers."
 )

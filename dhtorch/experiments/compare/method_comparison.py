@@ -35,7 +35,7 @@ from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.errors import Points
 
-QUESTION = "Is the method more accurate than the paper's, and does it know what it does not know?"
+QUESTION = "Is map more accurate than paper, and are its sigma and score calibrated?"
 EXPECTATION = (
     "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
 )

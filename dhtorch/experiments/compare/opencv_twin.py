@@ -17,7 +17,7 @@ from dhtorch.experiments import pair
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 
-QUESTION = "Does the torch pipeline give what the same seats filled by OpenCV give, scene by scene?"
+QUESTION = "Does the batched torch pipeline give the same results as the same stages by OpenCV, scene by scene?"
 EXPECTATION = "On every scene median error and coverage of ours are at most 10 % worse than the reference's."
 
 

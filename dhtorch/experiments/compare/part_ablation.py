@@ -25,7 +25,7 @@ from dhtorch.experiments.shared_tracks import stage_key
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.presets import MAP_PYRAMID_LEVELS
 
-QUESTION = "Which part of a method carries its gain over the one before it, and what does each cost?"
+QUESTION = "Which parts account for a method's gain over the one before it, and what does each cost?"
 EXPECTATION = "Either whole is better than every part alone, and no part can be left out without loss."
 
 #: Least change of a ratio that counts: reordering the points of a search changes it by as much.

@@ -56,7 +56,7 @@ _METRICS = (
     MainMetric("jump_auroc", larger_is_better=True),
 )
 
-QUESTION = "Does the judge find what is wrong with a depth map, and keep silent where nothing can tell?"
+QUESTION = "Does validation detect the errors of a depth map, and report unknown where there is no evidence?"
 EXPECTATION = "Every number of the list of bars is met; scenes, and of causes windows, are the unit."
 
 #: Number → (bar, whether it holds).

@@ -24,7 +24,7 @@ from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap, risk
 from dhtorch.metrics.errors import Points
 
-QUESTION = "Does a method that chooses its views reach the best fixed gap, and is it silent without a baseline?"
+QUESTION = "Does view selection reach the best fixed gap, and does it abstain without a baseline?"
 EXPECTATION = "On every scene as much at 5 % mean risk as at the gap that is best in hindsight, and silence in a turn."
 
 #: Least ratio to the coverage of the best gap that counts as reaching it.

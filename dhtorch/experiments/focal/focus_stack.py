@@ -46,7 +46,7 @@ _METRICS = (
     MainMetric("flip_share", larger_is_better=False),
 )
 
-QUESTION = "Does the classical recipe, the sharpest picture of every pixel, read depth off a focal stack?"
+QUESTION = "Does the classical method, the sharpest picture of every pixel, recover depth from a focal stack?"
 EXPECTATION = "On clean stacks; on light fields it fails, flips sign on some scenes, and confidence does not rescue it."
 
 RENDERED_CONDITIONS = ("clean", "noisy", "moved", "aligned", "light_field", "no_focus")

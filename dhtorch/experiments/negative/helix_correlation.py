@@ -42,7 +42,7 @@ _METRICS = (
     MainMetric("coverage", larger_is_better=True),
 )
 
-QUESTION = "Does correlating the two spiral signals in time squeeze out parallax?"
+QUESTION = "Does the correlation of the two spiral signals in time measure parallax?"
 EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flow does; forward motion is not seen."
 
 VARIANTS = ("own_arm", "between_arms", "best_arm", "flow", "flow_along_arm")

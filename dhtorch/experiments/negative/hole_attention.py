@@ -37,7 +37,7 @@ _METRICS = (
     MainMetric("rise", larger_is_better=True),
 )
 
-QUESTION = "Does looking at the holes fill them?"
+QUESTION = "Does denser sampling at the holes fill them?"
 EXPECTATION = "No: the hole rate rises; the classes of the holes say what could fill them."
 
 VARIANTS = ("centre", "attention", "random", "even")

@@ -19,7 +19,7 @@ from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, Sc
 from dhtorch.metrics import bootstrap
 from dhtorch.stages.sample import regular_grid, vogel_spiral
 
-QUESTION = "Which part of the method does the result hang on?"
+QUESTION = "Which part of the method determines the result?"
 EXPECTATION = "No change of a single part lowers the median error by more than a tenth."
 
 

@@ -49,7 +49,7 @@ _METRICS = (
     MainMetric("n_fragments", larger_is_better=False),
 )
 
-QUESTION = "Does fusing recovered points widen the map, and do they stitch its fragments into one?"
+QUESTION = "Does fusing recovered points into one map extend it, and do they connect its fragments?"
 EXPECTATION = "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands."
 
 MAP_TRUTH = "whole sensor"

@@ -24,7 +24,7 @@ from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Prot
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 
-QUESTION = "How good is triangulated depth on points that the pose never saw, and how many scenes pass the strict line?"
+QUESTION = "How accurate is triangulated depth, scene by scene, at points that the pose was not fitted to?"
 EXPECTATION = (
     "The hold-out error is five times that on the pose's own inliers; half of the scenes pass the strict line."
 )

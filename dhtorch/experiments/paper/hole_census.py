@@ -30,7 +30,7 @@ _METRICS = (
     MainMetric("trackability_valid", larger_is_better=None),
 )
 
-QUESTION = "Are most of the sensor's holes places where the picture could still be tracked?"
+QUESTION = "Are most of the sensor's holes trackable in the picture?"
 EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackability like that of samples with a return."
 
 

@@ -27,7 +27,7 @@ from dhtorch.experiments.outcome import join_outcomes
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 
-QUESTION = "Can near returns alone recover far depth, and is it the anchored pose that does it?"
+QUESTION = "Can near returns alone recover far depth, and is the pose from near returns the cause?"
 EXPECTATION = (
     "The gated method answers at least a quarter of the far candidates on the median scene, with an error below that "
     "of triangulation from the device's raw trajectory; the gates lower p90."

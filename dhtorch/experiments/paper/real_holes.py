@@ -16,7 +16,7 @@ from dhtorch.experiments.cohorts import missing_truth_reason, real_holes
 from dhtorch.experiments.paper.range_split import NO_GATES
 from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 
-QUESTION = "Are the sensor's real holes recovered as well as returns that were merely hidden?"
+QUESTION = "Are the sensor's real holes recovered as well as hidden returns?"
 EXPECTATION = "No: on the median scene the error on real holes is larger, and some scenes have no answer."
 
 

@@ -29,7 +29,7 @@ from dhtorch.pytree import Record, collate, record
 from dhtorch.records import PoseFit, Tracks
 from dhtorch.stages.score import LearnedScore, confidence, confidence_from_error, expected_error_loss, score_features
 
-QUESTION = "Does a score learnt from errors order answers better, in rooms it has not seen, than those made by hand?"
+QUESTION = "Does a score trained on errors rank answers better than the analytic ones, in rooms not trained on?"
 EXPECTATION = "Its AURC is lower than that of the paper's score and of rank_by_error, as a geometric mean over scenes."
 
 #: Hand-designed scores: variant → function.

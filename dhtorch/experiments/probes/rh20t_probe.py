@@ -62,7 +62,7 @@ from dhtorch.experiments.probes.probing import (
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 
-QUESTION = "Do depth features tell a ridge probe as much of a robot's next motion as DINOv2's do?"
+QUESTION = "Do depth features predict a robot's next motion as well as DINOv2's in a ridge probe?"
 EXPECTATION = "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move."
 
 #: Joint angles in the context; zeros fill up for a robot with fewer joints.

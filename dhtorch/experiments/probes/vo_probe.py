@@ -50,7 +50,7 @@ from dhtorch.geometry import se3
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.records import Frame
 
-QUESTION = "Within one scene, do depth features tell a ridge probe more of the camera's motion than DINOv2's do?"
+QUESTION = "Within one scene, do depth features predict the camera's motion better than DINOv2's in a ridge probe?"
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
 
 #: Block of a shard with the method's own relative pose.
