@@ -560,9 +560,7 @@ def validated_real() -> str:
     rows = []
     for row in json.loads((RESULTS / "validate_real.json").read_text()):
         whole, limited = row["whole"], row["whole"]["limited"]
-        wrong = (
-            "unknown" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
-        )
+        wrong = "unknown" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
         options = f" {' '.join(row['options'])}" if row["options"] else ""
         cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{limited['unknown']:.1%}"]

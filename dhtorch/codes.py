@@ -132,7 +132,7 @@ class Gate(CodeTable):
         meaning="the views lie too close together for what is far",
         advice="moving sideways would help",
     )
-    LOW_SCORE: Final = code(10, "score below the threshold", meaning="answers that are not sure enough")
+    LOW_SCORE: Final = code(10, "score below the threshold", meaning="answers with too low a score")
     CONTRADICTED: Final = code(
         11,
         "far tracks contradict the near returns: these lie on moving objects",
@@ -204,7 +204,7 @@ class State(CodeTable):
 class WrongCause(CodeTable):
     """Codes of the causes of wrong pixels of a validated depth map."""
 
-    NONE: Final = code(0, "not wrong, or not known")
+    NONE: Final = code(0, "not wrong, or unknown")
     OTHER: Final = code(1, "wrong for none of the causes below")
     GHOST: Final = code(
         2,

@@ -63,7 +63,7 @@ COMMANDS: dict[str, Command] = {
         _YOURS,
         "depth beyond the sensor's range: completed maps, a 3D map, a page",
         "PATH",
-        "Recovers depth beyond the sensor's range from a capture of your own and says how to go on. Frames "
+        "Recovers depth beyond the sensor's range from a capture of your own and prints how to continue. Frames "
         "are processed in an order that covers the capture at any time, until the time limit. Writes depth/, "
         "sigma/, source/, meta/ and previews/ of every frame, overview.png (picture, sensor, completed), "
         "preview.mp4, map.ply, map.glb and view.html (3D, in any browser).",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dhtorch.codes import Gate, describe, words
 
 #: Reasons that are no gates -> what they mean.
-_OTHER_MEANINGS = {"unfit": "farther than the files can say", "no_other_view": "there was no other view"}
+_OTHER_MEANINGS = {"unfit": "farther than the file format can store", "no_other_view": "there was no other view"}
 
 
 def describe_gate(name: str) -> str:

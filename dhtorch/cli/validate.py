@@ -441,14 +441,14 @@ def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | No
         return []
     start = f"maps are {_format_factor(scale)} times the sensor's depth"
     if sensor is None or sensor <= 0:
-        return [f"{start}; without usable poses it cannot be known which of the two is wrong"]
+        return [f"{start}; without usable poses which of the two is wrong cannot be determined"]
     off_maps = abs(math.log(scale * sensor))
     off_sensor = abs(math.log(sensor))
     if off_maps < _MAX_WITNESS_RATIO * off_sensor:
         return [f"{start}, and agree with the poses: the sensor's scale is wrong (data.depth_unit=)"]
     if off_sensor < _MAX_WITNESS_RATIO * off_maps:
         return [f"{start}, which agrees with the poses: the maps' scale is wrong"]
-    return [f"{start}; the poses agree with neither, it cannot be known which is wrong"]
+    return [f"{start}; the poses agree with neither, so which is wrong cannot be determined"]
 
 
 def _format_factor(value: float) -> str:

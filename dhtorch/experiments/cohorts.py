@@ -121,7 +121,7 @@ def missing_trajectory_reason(scene: Scene) -> str | None:
 
 def missing_truth_reason(scene: Scene) -> str | None:
     """Reason for missing independent truth; None if the recording has it."""
-    return None if isinstance(scene.recording, TruthRecording) else "no independent truth"
+    return None if isinstance(scene.recording, TruthRecording) else "no independent ground truth"
 
 
 def _restrict_candidates(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:

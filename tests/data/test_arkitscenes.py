@@ -382,7 +382,7 @@ def test_laser_depth_far_in_time_or_in_disagreement_is_no_truth(tmp_path: Path) 
         root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": [wrong]}, trajectory=frames
     )
     recording = stored(root)
-    assert recording.report == ("8 frames without laser depth within 0.08 s: no truth",)
+    assert recording.report == ("8 frames without laser depth within 0.08 s: no ground truth",)
     rejected = recording.truth(0)
     assert not rejected["depth"].any() and float(rejected["disagreement"]) == pytest.approx(0.091, abs=0.002)
     assert stored(root, max_disagreement=0.2).truth(0)["depth"].all()

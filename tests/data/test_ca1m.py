@@ -86,7 +86,7 @@ def test_failed_registration_is_rejected(tmp_path: Path) -> None:
     lasers[1] = lasers[1].replace(depth=lasers[1].depth * 0.9)
     writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames, lasers, without=[(0, "gt/depth.png")])
     recording = data.open(tmp_path)
-    assert recording.report == ("1 frame without gt/depth: no truth",)
+    assert recording.report == ("1 frame without gt/depth: no ground truth",)
     none, bad = recording.truth(0), recording.truth(1)
     assert none["depth"].shape == (1, *VGA_HW) and not none["depth"].any() and math.isnan(none["disagreement"])
     assert not bad["depth"].any() and float(bad["disagreement"]) == pytest.approx(0.111, abs=0.005)

@@ -291,7 +291,7 @@ def test_poses_in_a_frame_that_may_move_are_named(tmp_path: Path) -> None:
 
     write_rosbag(tmp_path / "bag", walk(2), BagLayout(poses=False), begin=begin)
     recording = data.open(tmp_path / "bag")
-    assert recording.report == ("poses are relative to the frame base_link: right only while that stands still",)
+    assert recording.report == ("poses are relative to the frame base_link: valid only while that is stationary",)
     same_frames(recording, walk(2))
 
 

@@ -33,6 +33,18 @@ def expected_code(line):
     return int(stated[1]) if stated else 0
 
 
+def masked(text):
+    """Text with N for every number: other processors round otherwise."""
+    return re.sub(r"\d[\d.,]*", "N", text)
+
+
+def shown(page):
+    """Lines of output that a page shows; blocks of code that is not run do not count."""
+    text = (TUTORIALS / f"{page}.md").read_text(encoding="utf-8")
+    output = re.findall(r"^```text\n(.*?)^```", text, re.M | re.S)
+    return [line for block in output if "LeRobotDataset" not in block for line in block.strip("\n").splitlines()]
+
+
 def test_every_tutorial_is_run():
     assert {p.stem for p in TUTORIALS.glob("*.md")} == set(MADE)
 
@@ -51,16 +63,10 @@ def test_a_tutorial_works_as_it_is_written(page, tmp_path, monkeypatch, capsys):
             program, *arguments = shlex.split(line, comments=True)
             assert program == "dhtorch"
             assert main(arguments) == expected_code(line), (line, capsys.readouterr().err)
-    printed = re.sub(r"[\d.,]+", "N", capsys.readouterr().out)
+    printed = masked(capsys.readouterr().out)
     assert not [name for name in MADE[page] if not (tmp_path / name).is_file()]
+    for line in shown(page):
+        assert masked(line) in printed, line
     if page == "lerobot_set":
-        sensor, completed = re.findall(r"N% of the pixels have a depth", printed)
-        assert sensor and completed
         share = [float((names[name][2].depth > 0).float().mean()) for name in ("sensor", "completed")]
         assert share[1] > share[0] + 0.1, "depth beyond the sensor"
-    if page == "phone_scan":
-        shown = re.search(
-            r"^```text\n(.*?)^```", (TUTORIALS / "phone_scan.md").read_text(encoding="utf-8"), re.M | re.S
-        )
-        for line in shown[1].strip().splitlines():
-            assert re.sub(r"[\d.,]+", "N", line) in printed, line

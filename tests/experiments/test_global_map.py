@@ -54,7 +54,7 @@ def test_without_a_trajectory_there_are_maps_of_estimated_poses_alone():
     blind = Changed(room(n_frames=3), poses=None)
     found = asked(blind)
     assert found.verdict == "undecided" and found.why == "no scene with a trajectory"
-    assert found.scenes("fused device", experiment.MAP_TRUTH)["synthetic_room"]["note"] == "nothing to ask"
+    assert found.scenes("fused device", experiment.MAP_TRUTH)["synthetic_room"]["note"] == "nothing to estimate"
     assert found.scenes("fused anchored", experiment.MAP_TRUTH)["synthetic_room"]["n_voxels"] > 0
 
 

@@ -149,7 +149,7 @@ def test_classes_and_routes_are_shares_of_the_holes():
 
 def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
     full = asked(small_room(lidar="exact", hw=(96, 128)), stride=5)
-    assert full.verdict == "undecided" and shown(full)["attention"]["note"] == "nothing to ask"
+    assert full.verdict == "undecided" and shown(full)["attention"]["note"] == "nothing to estimate"
     with pytest.raises(ValueError, match="expected a sampler with an option gaze"):
         asked(small_room(), base=configured_method().replace(sample=regular_grid))
     with pytest.raises(ValueError, match="stride is 0"):

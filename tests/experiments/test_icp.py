@@ -178,7 +178,7 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
     blind, empty = Changed(small_room(), poses=None), small_room(lidar=None)
     assert experiment.verdict(asked(blind))[0] is None
     silent = asked(empty)
-    assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to ask" and len(silent.rows) == 9
+    assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to estimate" and len(silent.rows) == 9
     with pytest.raises(ValueError, match="found 1 frame of synthetic_room and links=10, expected at least two"):
         asked(small_room(hw=(96, 128), n_frames=1), links=10)
 

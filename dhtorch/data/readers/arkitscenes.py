@@ -139,7 +139,8 @@ def read(
         return [Recording(**fields, report=tuple(report))]
     load_truth = _make_truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
     if (n_without := load_truth.depths.count(None)) > 0:
-        report.append(f"{format_count(n_without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
+        missing = format_count(n_without, "frame")
+        report.append(f"{missing} without laser depth within {max_truth_gap} s: no ground truth")
     return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
 
 

@@ -219,7 +219,7 @@ def _make_recording(
     if "gt/depth" not in spans:
         return Recording(**fields, report=tuple(report))
     if (n_without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
-        report.append(f"{format_count(n_without, 'frame')} without gt/depth: no truth")
+        report.append(f"{format_count(n_without, 'frame')} without gt/depth: no ground truth")
     return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
 
 

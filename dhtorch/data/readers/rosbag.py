@@ -336,7 +336,7 @@ def _find_poses(
         return None, pairs, [remark]
     report = files.format_left_out(pairs[~covered, 0].tolist(), f"no transform of {colour.head.frame} at its time")
     if world not in WORLD_FRAMES:
-        report.append(f"poses are relative to the frame {world}: right only while that stands still")
+        report.append(f"poses are relative to the frame {world}: valid only while that is stationary")
     return c2w[covered], pairs[covered], report
 
 

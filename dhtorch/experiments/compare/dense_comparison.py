@@ -41,7 +41,7 @@ from dhtorch.records import DepthMap, Estimate, Frame, Pose, Samples
 
 QUESTION = "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?"
 EXPECTATION = (
-    "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
+    "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were not fitted on."
 )
 
 #: Number → (bar, whether it holds).

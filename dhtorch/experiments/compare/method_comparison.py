@@ -37,7 +37,7 @@ from dhtorch.metrics.errors import Points
 
 QUESTION = "Is map more accurate than paper, and are its sigma and score calibrated?"
 EXPECTATION = (
-    "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
+    "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were not fitted on."
 )
 
 #: Number → (bar, whether it holds); the second of two bars is for a method of several views.

@@ -72,7 +72,7 @@ ABLATION_GROUPS = {
 _NUMBER_LABELS = {
     "median_rel_ratio_at_equal_coverage": "error ratio at equal coverage",
     "aurc_ratio": "ratio of areas under risk–coverage",
-    "aurc_full_ratio_to_window": "ratio to window of areas with silence as 1",
+    "aurc_full_ratio_to_window": "ratio to window of areas with unanswered as risk 1",
 }
 
 
