@@ -151,7 +151,9 @@ def test_one_group_alone_also_where_there_is_one_other_frame():
     assert outcome.summary["+ chosen views.aurc_full_ratio_to_window"]["value"] < 0.9
     assert all(outcome.summary[f"{name}.pair_ms"]["value"] > 0 for name in variants)
     assert set(asked) == {("auto", 2), ("window", 2)}
-    assert "ratio to window of areas with unanswered as risk 1" in outcome.why and "at equal coverage" not in outcome.why
+    assert (
+        "ratio to window of areas with unanswered as risk 1" in outcome.why and "at equal coverage" not in outcome.why
+    )
 
 
 @pytest.mark.slow

@@ -218,7 +218,10 @@ def test_a_scene_without_a_trajectory_or_truth_says_so():
     assert scene(outcome, "device_raw")["note"] == "no device trajectory"
     assert scene(outcome, "gated")["n_candidates"] > 0
     outcome = asked(real_holes, untold(small_room()))
-    assert outcome.verdict == "undecided" and scene(outcome, "gated", "real_holes")["note"] == "no independent ground truth"
+    assert (
+        outcome.verdict == "undecided"
+        and scene(outcome, "gated", "real_holes")["note"] == "no independent ground truth"
+    )
 
 
 def test_real_holes_are_drop_outs_with_known_depth():
