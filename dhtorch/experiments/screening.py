@@ -74,7 +74,7 @@ def screen_scenes(
         for variant in variants:
             variant_results = [result[variant] for result in results if variant in result]
             row = {**scene_name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
-            note = {} if variant_results else {"note": "nothing to ask"}
+            note = {} if variant_results else {"note": "nothing to estimate"}
             part.rows.append(
                 row
                 | {"n_pairs": len(variant_results)}
