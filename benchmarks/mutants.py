@@ -58,6 +58,7 @@ PLACES = (
     "pipeline/surface",
     "pipeline/map_filters",
     "ops/loader",
+    "ops/builder",
     "ops/dispatch",
     "alignment",
     "validation",

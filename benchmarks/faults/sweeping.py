@@ -21,6 +21,7 @@ TESTS: dict[str, list[str]] = {
     ],
     "transforms.maps": ["tests/transforms/test_dense_loader.py"],
     "ops.loader": ["tests/ops/test_compiled.py"],
+    "ops.builder": ["tests/ops/test_compiled.py"],
     "ops.dispatch": ["tests/ops/test_compiled.py"],
 }
 
@@ -220,13 +221,22 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "ops.loader": [
         ("cache", "if folder:", "if not folder:"),
-        ("library", "torch.__version__, ", ""),
-        ("library", "processor(), ", ""),
-        ("build", "if process.returncode:", "if False:"),
-        ("load", "if not path.is_file():", "if False:"),
-        ("build", "_check_torch_version()", "None"),
-        ("_check_torch_version", "version < MIN_TORCH_VERSION", "version <= (2, 5)"),
+        ("file_name", "constants_header(), ", ""),
+        ("file_name", "platform.machine(), ", ""),
+        ("level", "LEVELS.get(torch.backends.cpu.get_cpu_capability(), ", "LEVELS.get('', "),
+        ("problem", "status.st_mode & stat.S_IWOTH", "False"),
+        ("problem", "checksum(path) == expected", "True"),
+        ("load", "if reason is None:\n            try:", "if True:\n            try:"),
+        ("load", "(INSTALLED / name, cache() / name)", "(cache() / name, INSTALLED / name)"),
+        ("load_if_present", 'switch == "0" or ', ""),
+        ("load_if_present", "(not switch and _tried)", "False"),
+        ("_is_recent", ">= MIN_TORCH_VERSION", ">= (2, 5)"),
         ("constants_header", "isinstance(value, int)", "isinstance(value, float)"),
+    ],
+    "ops.builder": [
+        ("build", "and loader.problem(path) is None", ""),
+        ("build", "loader.check_torch_version()", "None"),
+        ("_run", "if process.returncode:", "if False:"),
     ],
     "ops.dispatch": [
         (
@@ -234,7 +244,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "torch.compiler.is_compiling() or forward_ad._current_level >= 0",
             "torch.compiler.is_compiling()",
         ),
-        ("is_in_use", 'in ("", "0")', 'in ("",)'),
+        ("is_in_use", "loader.is_loaded() or loader.load_if_present()", "loader.load_if_present()"),
         ("can_dispatch", "(grad_enabled and x.requires_grad) or ", ""),
         ("can_dispatch", "not (any_layout or x.is_contiguous())", "False"),
         ("can_dispatch", "x.dtype not in dtypes", "x.is_complex()"),
