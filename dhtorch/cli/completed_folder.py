@@ -97,7 +97,7 @@ def build_shared_metadata(
     (modules), the data digest, and ``more`` (which separates the files of different commands)."""
     config = {k: settings[k] for k in keyed} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
     run_metadata = result_files.collect_run_metadata(
-        device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"], operators=loader.describe()
+        device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"], operators=loader.describe_operators()
     )
     name = settings["choices"]["data"]
     metadata: Row = storage.to_strict_json(

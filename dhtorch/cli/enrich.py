@@ -348,7 +348,7 @@ def _build_metadata(
     }
     digest = result_files.compute_data_digest(files)
     run_metadata = result_files.collect_run_metadata(
-        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe()
+        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe_operators()
     )
     name = settings["choices"]["data"]
     source = whole.roots[0].resolve().name if whole.roots else name

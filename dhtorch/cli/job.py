@@ -188,7 +188,9 @@ def _scenes_key(settings: Mapping[str, Any], key: str) -> str:
 
 def _collect_metadata(settings: Mapping[str, Any]) -> dict[str, Any]:
     options = {name: settings[name] for name in ("device", "dtype", "seed")}
-    return result_files.collect_run_metadata(**options, threads=torch.get_num_threads(), operators=loader.describe())
+    return result_files.collect_run_metadata(
+        **options, threads=torch.get_num_threads(), operators=loader.describe_operators()
+    )
 
 
 def _make_pair_settings(settings: Mapping[str, Any], finished: FinishedScenes) -> Settings:

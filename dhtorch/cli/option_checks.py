@@ -190,7 +190,8 @@ def list_choices(argv: Sequence[str], folder: Path) -> dict[str, list[str]]:
         key, sign, text = word.lstrip("+").partition("=")
         if not sign or "/" in key or not key or not (folder / key).is_dir():
             continue
-        names, value = sorted(p.stem for p in (folder / key).glob("*.yaml")), parser.parse_override(word).value()
+        names = sorted(p.stem for p in (folder / key).glob("*.yaml"))
+        value = parser.parse_override(word).value()
         if isinstance(value, Glob):
             value = value.filter(names) or [text]
         value = value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]

@@ -177,7 +177,7 @@ def _dispatch(argv: list[str]) -> int:
 
 def _format_version() -> str:
     """Version, and what computes the operators."""
-    operators = importlib.import_module("dhtorch.ops.loader").describe()
+    operators = importlib.import_module("dhtorch.ops.loader").describe_operators()
     return f"dhtorch {dhtorch.__version__}, operators: {operators}"
 
 

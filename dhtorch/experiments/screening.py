@@ -64,7 +64,8 @@ def screen_scenes(
     """
 
     def screen(scene: ScreenedScene) -> Outcome:
-        part, chosen = Outcome(), list(items(scene))
+        part = Outcome()
+        chosen = list(items(scene))
         with torch.no_grad():
             results = [evaluate(scene, item) for item in progress(chosen, scene.name, len(chosen))]
             replacements = whole(scene, results)
@@ -85,7 +86,8 @@ def screen_scenes(
         part.n_pairs = len(chosen)
         return part
 
-    outcome, keep = Outcome(metrics=metrics), finished.loop()
+    outcome = Outcome(metrics=metrics)
+    keep = finished.loop()
     for scene in scenes:
         outcome.add(keep(scene.name, partial(screen, scene)))
     outcome.summary = summarise_rows(outcome.rows, variants, [truth])

@@ -174,7 +174,7 @@ def _shared_metadata(
     files = {**result_files.list_files_below(extraction_plan.roots), **result_files.list_files_named(config)}
     name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
     run_metadata = result_files.collect_run_metadata(
-        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe()
+        device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe_operators()
     )
     metadata: dict[str, Any] = storage.to_strict_json(
         {

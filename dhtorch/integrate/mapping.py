@@ -415,7 +415,7 @@ def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: l
             dtype=settings["dtype"],
             threads=threads,
             seed=settings["seed"],
-            operators=loader.describe(),
+            operators=loader.describe_operators(),
         ),
         config=config,
         data={

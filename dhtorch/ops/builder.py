@@ -48,12 +48,14 @@ def build(folder: Path | None = None, level: str | None = None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as work:
-            made = _compile(compiler, Path(work), level)
-            made.chmod(0o755)
+            compiled_file = _compile(compiler, Path(work), level)
+            compiled_file.chmod(0o755)
             note = Path(work) / "manifest.json"
-            note.write_text(json.dumps({"sha256": loader.checksum(made), "compiler": compiler}), encoding="utf-8")
+            note.write_text(
+                json.dumps({"sha256": loader.checksum(compiled_file), "compiler": compiler}), encoding="utf-8"
+            )
             note.replace(loader.manifest(path))
-            made.replace(path)
+            compiled_file.replace(path)
     except PermissionError as error:
         raise OSError(
             f"{folder}: no permission to write compiled operators; set DHTORCH_CACHE to another folder"
@@ -91,12 +93,12 @@ def _compile(compiler: Sequence[str], work: Path, level: str) -> Path:
         ]
         for each in compiled:
             each.result()
-    made = work / "library.so"
+    compiled_file = work / "library.so"
     link = (
         ["-undefined", "dynamic_lookup"] if sys.platform == "darwin" else [f"-L{torch_folder / 'lib'}", "-ltorch_cpu"]
     )
-    _run([*compiler, "-shared", *map(str, objects), *link, "-o", str(made)])
-    return made
+    _run([*compiler, "-shared", *map(str, objects), *link, "-o", str(compiled_file)])
+    return compiled_file
 
 
 def _run(command: Sequence[str]) -> None:

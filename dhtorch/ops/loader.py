@@ -226,7 +226,7 @@ def is_loaded() -> bool:
     return bool(_loaded)
 
 
-def describe() -> str:
+def describe_operators() -> str:
     """What computes the operators of this process: ``compiled x86-64-v4``, or ``torch``."""
     return f"compiled {level()}" if _loaded or load_if_present() else "torch"
 

@@ -169,7 +169,7 @@ def _sparse_answers(estimate: Estimate) -> _Answers:
     sigma, shared = ((x / depth).detach() for x in (sigma, shared))
     n_views = estimate.n_views
     expected = sigma / (n_views - 1).clamp_min(1).to(sigma).sqrt()
-    return _Answers(keep, 1 / depth, sigma, shared, expected, n_views, _terms(estimate.kept_parts, keep, depth))
+    return _Answers(keep, 1 / depth, sigma, shared, expected, n_views, terms=_terms(estimate.kept_parts, keep, depth))
 
 
 def _swept_answers(swept: DepthMap, sweep: Sweep, shared_q: Tensor, at: Tensor) -> _Answers:
@@ -183,7 +183,7 @@ def _swept_answers(swept: DepthMap, sweep: Sweep, shared_q: Tensor, at: Tensor) 
     shared = torch.minimum(torch.maximum(pose_var.sqrt(), shared_q.to(sigma)) * depth.detach(), sigma)
     n_views = sweep.n_views[:, None].expand_as(keep)
     parts = swept.replace(sigma=swept.sigma.detach()).budget.map(lambda x: sample_nearest(x, at)[0])
-    return _Answers(keep, 1 / depth, sigma, shared, sigma, n_views, _terms(parts, keep, depth))
+    return _Answers(keep, 1 / depth, sigma, shared, sigma, n_views, terms=_terms(parts, keep, depth))
 
 
 def _terms(parts: SigmaBudget, keep: Tensor, depth: Tensor) -> Tensor:

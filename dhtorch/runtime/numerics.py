@@ -13,11 +13,11 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
-P = ParamSpec("P")
-T = TypeVar("T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
-def standard_numerics(function: Callable[P, T]) -> Callable[P, T]:
+def standard_numerics(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Decorator: within a call the default dtype is float32, the default device the CPU, and autocast is off.
 
     Nothing is changed where they are so already, or while ``torch.compile`` traces. The default dtype belongs to the
@@ -25,7 +25,7 @@ def standard_numerics(function: Callable[P, T]) -> Callable[P, T]:
     """
 
     @wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
         with _standard_defaults():

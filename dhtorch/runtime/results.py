@@ -284,7 +284,7 @@ def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
 def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int, operators: str) -> dict[str, Any]:
     """Time, code version, package versions, hardware and seed of a job.
 
-    ``operators`` is what computes those with compiled kernels: :func:`dhtorch.ops.loader.describe`.
+    ``operators`` is what computes those with compiled kernels: :func:`dhtorch.ops.loader.describe_operators`.
     """
     versions = {"python": platform.python_version(), **{name: _package_version(name) for name in _PACKAGES}}
     return {

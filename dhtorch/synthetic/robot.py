@@ -224,9 +224,12 @@ class _Step:
     @staticmethod
     def of(task: int, scene: int, seed: int) -> _Step:
         """The step of a task, which determines the target's looks, and a scene, which determines the rest."""
-        of_task, draw = Random(f"robot {seed} {task}"), Random(f"robot {seed} {task} {scene}")
-        picture, apparent = of_task.choice(_PICTURES), of_task.uniform(*_APPARENT_WIDTH)
-        aspect, pitch = of_task.uniform(*_ASPECT), of_task.uniform(-10, 0)
+        of_task = Random(f"robot {seed} {task}")
+        draw = Random(f"robot {seed} {task} {scene}")
+        picture = of_task.choice(_PICTURES)
+        apparent = of_task.uniform(*_APPARENT_WIDTH)
+        aspect = of_task.uniform(*_ASPECT)
+        pitch = of_task.uniform(-10, 0)
         d = math.exp(draw.uniform(*map(math.log, _DISTANCE_M)))
         width = d * apparent * (1 + draw.uniform(-_APPARENT_SPREAD, _APPARENT_SPREAD))
         size = (width, width * aspect, 0.3 * width)
@@ -238,7 +241,8 @@ class _Step:
             at = (z * (x + draw.uniform(-0.04, 0.04)), z * (y + draw.uniform(-0.03, 0.03)), z)
             box = (z * apparent, z * apparent * draw.uniform(0.6, 1.2), 0.08)
             things.append(_make_thing(pose, at, box, draw.choice(_PICTURES), draw.uniform(-30, 30)))
-        way, speed = draw.uniform(0, 2 * math.pi), draw.uniform(*_DRIFT_M_PER_S)
+        way = draw.uniform(0, 2 * math.pi)
+        speed = draw.uniform(*_DRIFT_M_PER_S)
         turn = [math.radians(draw.uniform(-_TURN_DEG_PER_S, _TURN_DEG_PER_S)) for _ in range(3)]
         back, below, beside = (draw.uniform(*limits) for limits in _BASE_M)
         return _Step(

@@ -278,7 +278,7 @@ def test_ctrl_c_keeps_the_old_page(command, monkeypatch, said, words, module, na
 
 def test_version_is_ours(command):
     code, out, _ = command("--version")
-    assert (code, out.strip()) == (0, f"dhtorch {dhtorch.__version__}, operators: {loader.describe()}")
+    assert (code, out.strip()) == (0, f"dhtorch {dhtorch.__version__}, operators: {loader.describe_operators()}")
 
 
 # ----------------------------------------------------------------------------------------------------------- completion

@@ -948,10 +948,10 @@ def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
 @needs_compiler
 def test_a_library_is_in_use_where_there_is_one_unless_it_is_turned_off(cache, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(cache))
-    assert not dispatch.is_in_use() and loader.describe() == "torch" and not loader._loaded
+    assert not dispatch.is_in_use() and loader.describe_operators() == "torch" and not loader._loaded
     monkeypatch.delenv("DHTORCH_OPS")
     assert dispatch.is_in_use() and loader._loaded == [loader.library()]
-    assert loader.describe() == f"compiled {loader.level()}"
+    assert loader.describe_operators() == f"compiled {loader.level()}"
     assert {*cache.iterdir()} == {loader.library(), loader.manifest(loader.library())}, "nothing unfinished stays"
 
 
@@ -960,7 +960,7 @@ def test_without_a_library_torch_computes_and_nothing_is_compiled(tmp_path, monk
     monkeypatch.delenv("DHTORCH_OPS")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not dispatch.is_in_use() and loader.describe() == "torch"
+        assert not dispatch.is_in_use() and loader.describe_operators() == "torch"
     monkeypatch.setenv("DHTORCH_OPS", "1")
     with pytest.raises(FileNotFoundError, match=f"no library for .*; compile it with {loader.COMMAND}"):
         plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))

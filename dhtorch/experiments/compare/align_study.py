@@ -150,7 +150,8 @@ def run(
         ]
         return Outcome(scene_rows, n_pairs=len(frames))
 
-    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    outcome = Outcome(metrics=_METRICS)
+    keep = settings.finished.loop()
     for scene in scenes_of(scenes):
         outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_alignment(outcome.rows, names) | leave_one_scene_out(outcome.rows, names)

@@ -207,7 +207,8 @@ def run(
         rows = [*reference_rows, *window_rows, _scene_row(scene, reference_rows)]
         return Outcome(rows, n_pairs=len(reference_rows))
 
-    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    outcome = Outcome(metrics=_METRICS)
+    keep = settings.finished.loop()
     for scene in all_scenes:
         outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_validation(outcome.rows)

@@ -68,7 +68,8 @@ def run(
             rows[-1] |= count_holes(classify_frame(method, recording[i].to(settings.dtype).to(settings.device)))
         return Outcome([*rows, _join_frames(rows, scene)], n_pairs=len(rows))
 
-    outcome, keep = Outcome(metrics=_METRICS), settings.finished.loop()
+    outcome = Outcome(metrics=_METRICS)
+    keep = settings.finished.loop()
     for scene in scenes_of(scenes):
         outcome.add(keep(scene.name, partial(count_scene, scene)))
     scene_rows = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]

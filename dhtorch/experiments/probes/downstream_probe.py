@@ -206,10 +206,12 @@ def verdict(by_block: ProbeErrors, by_stream: ProbeErrors, origin: str | None) -
     beside = f" + {REFERENCE_BLOCK}" if (REFERENCE_BLOCK, ALL_COHORT) in by_block.squares else ""
     ours, sensor, true = (f"{arm}{beside}" for arm in (_OURS, SENSOR_BLOCK, DEPTH_CONTROL))
     ratio = by_block.ratio(ours, sensor, ALL_COHORT)
-    error, vs_context = by_block.mean(ours, ALL_COHORT).value, by_block.ratio(ours, CONTEXT_BLOCK, ALL_COHORT)
+    error = by_block.mean(ours, ALL_COHORT).value
+    vs_context = by_block.ratio(ours, CONTEXT_BLOCK, ALL_COHORT)
     positive, negative = (by_block.ratio(a, CONTEXT_BLOCK, ALL_COHORT) for a in (POSITIVE_CONTROL, NEGATIVE_CONTROL))
     true_ratio, alone = by_block.ratio(true, sensor, ALL_COHORT), by_block.ratio(_OURS, SENSOR_BLOCK, ALL_COHORT)
-    n, samples = len(by_block.groups), int(by_block.counts[ALL_COHORT].sum())
+    n = len(by_block.groups)
+    samples = int(by_block.counts[ALL_COHORT].sum())
     needed = probing.groups_needed(by_block, ours, sensor, ALL_COHORT, _RATIO_OF_INTEREST)
     failed = probing.check_controls(positive, negative)
     if failed is None and not (true_ratio.high is not None and true_ratio.high < 1):

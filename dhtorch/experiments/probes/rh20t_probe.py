@@ -150,7 +150,9 @@ def run(
         reader = _read_samples({k: chosen[k] for k in wanted}, settings, true_depth)
         for k, ((task, key), (scene, samples)) in enumerate(zip(keys, chosen, strict=True)):
             read = partial(_read_scene, reader, k, scene.name, progress)
-            shards.add(task, key, partial(_make_shard, scene, samples, read, method, networks, settings, **sizes))
+            shards.add(
+                task, key, partial(_make_shard, scene, samples, read, method, networks, settings=settings, **sizes)
+            )
         arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
         probe_errors = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n

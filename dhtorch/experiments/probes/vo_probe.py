@@ -263,7 +263,7 @@ class _PairFeatures:
         wanted = [k for k, missing in enumerate(shards.missing(keys)) if missing]
         reader = self._reader({k: parts[k] for k in wanted})
         for k, ((group, key), (_, scene, block)) in enumerate(zip(keys, parts, strict=True)):
-            make = partial(self._make_shard, group, scene, block, moving, progress, partial(reader.read, k))
+            make = partial(self._make_shard, group, scene, block, moving, progress, read=partial(reader.read, k))
             shards.add(group, key, make)
 
     def _reader(self, parts: Mapping[int, tuple[str, Scene, Sequence[tuple[int, int]]]]) -> loading.ChunkReader:
