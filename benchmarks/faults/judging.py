@@ -20,7 +20,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "metrics.uncertainty": [
         ("range_bias", "answered.true_depth.log()", "answered.depth.log()"),
         ("range_bias", "error.numel() >= min_answers", "error.numel() > 0"),
-        ("interval_coverage", "answered.sigma.isfinite()", "(answered.sigma > 0)"),
+        ("interval_coverage", " & (stated.true_depth <= high)", ""),
         ("interval_coverage", "(stated.true_depth >= low) & ", ""),
         ("disjoint_agreement", "variance + other_variance", "variance"),
         ("_independent_part", " - estimate.budget.reference", ""),

@@ -285,12 +285,14 @@ def _views_study(result: Result) -> list[ReportTable]:
 
 
 def _uncertainty(result: Result) -> list[ReportTable]:
-    """Tables of the study of stated uncertainty: over scenes, and by scene."""
+    """Tables of the study of stated uncertainty: over scenes, and of the last method by scene."""
     columns = ("n_scenes", *_UNCERTAINTY_COLUMNS[:2], "scenes_within", "room_bias", "bias_over_floor", "aurc", "ause")
-    by_scene = ("n_kept", *_UNCERTAINTY_COLUMNS, "calibrated_2", "floor", *(f"{term}_share" for term in _TERMS))
+    by_scene = ("n_kept", *_UNCERTAINTY_COLUMNS[:-1], "calibrated_2", "floor", *(f"{term}_share" for term in _TERMS))
+    last = variant_names(result)[-1]
+    of_last = {**result, "rows": [row for row in result["rows"] if row["method"] == last and not row.get("role")]}
     return [
         variant_table(result, "Intervals and bias, over scenes", (*columns, "chi2", "chi2_median")),
-        scene_table(result, "Intervals, bias and the causes of sigma, by scene", by_scene),
+        scene_table(of_last, f"{last} by scene, with the shares of the causes in sigma² (medians of pairs)", by_scene),
     ]
 
 
