@@ -602,13 +602,13 @@ SCALED = {
     "sound_refused": ("sound models refused", "≤ 0.02"),
     "faulty_refused": ("models bent or drifting by 3 % or more refused", "≥ 0.95"),
     **{
-        f"refused_{fault}_{size}": (f"of these: {words}, {float(size):.0%}", "")
+        f"refused_{fault}_{size}": (f"{words}, by {100 * float(size):g} %", "")
         for fault, words in (
-            ("drift", "drift along the recording"),
-            ("bend", "other scale in the middle"),
-            ("frames", "a quarter of the frames"),
-            ("range", "change over the sensor's range"),
-            ("region", "not of these: a sixth of the near scene"),
+            ("drift", "refused: drift along the recording"),
+            ("bend", "refused: other scale in the middle of the recording"),
+            ("frames", "refused: other scale of a quarter of the frames"),
+            ("range", "refused: change over the sensor's range"),
+            ("region", "refused, not among these: other scale of a sixth of the near scene"),
         )
         for size in ("0.03", "0.05", "0.1")
     },
