@@ -327,7 +327,7 @@ COMMANDS: dict[str, Command] = {
         "and range). A model whose parts have different scales is refused, with where and how much.",
         (
             ("MODEL CAPTURE", "a COLMAP folder, transforms.json, npz files or a splat's PLY"),
-            ("MODEL CAPTURE --sensor iphone_lidar", "with the accuracy and range of the capture's sensor"),
+            ("MODEL CAPTURE --sensor iphone_lidar", "with the accuracy of the capture's sensor"),
             ("MODEL CAPTURE --frame capture --out DIR", "also turned and moved to the capture's poses"),
         ),
         ("out", "images", "sensor", "cutoff", "frame", "max_frames", "tolerance", "fov", "depth_unit"),

@@ -17,9 +17,10 @@ import torch
 
 from dhtorch.data.io import decode as files
 from dhtorch.data.scene import scenes_of
+from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.measure.local_scales import REGIONS, ScaleTolerance
 from dhtorch.measure.models import Similarity, read_model, write_model
-from dhtorch.measure.scale import RANGE_SENSORS, ScaleOptions, ScaleResult, metric_scale
+from dhtorch.measure.scale import ScaleOptions, ScaleResult, metric_scale
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.plots import Panel, fit_axis, save_figure
@@ -69,8 +70,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
 
 
 def _check_options(settings: Mapping[str, Any]) -> None:
-    if settings["sensor"] not in RANGE_SENSORS:
-        raise ValueError(f"sensor: found {settings['sensor']!r}, expected one of {', '.join(RANGE_SENSORS)}")
+    if settings["sensor"] is not None:
+        get_sensor_noise(settings["sensor"])
     if settings["device"] != "cpu":
         raise ValueError(f"device: found {settings['device']!r}, expected cpu: the measurement is small")
     if settings["frame"] not in ("model", "capture"):

@@ -30,6 +30,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import sample_nearest
+from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.measure.local_scales import (
     DEFAULT_SCALE_TOLERANCE,
     LocalScales,
@@ -48,29 +49,9 @@ from dhtorch.stages.track import lucas_kanade
 
 _Chosen = TypeVar("_Chosen")
 
-
-class RangeSensor(NamedTuple):
-    """What all returns of a depth sensor have in common: its range, and the standard deviation of its own scale."""
-
-    reach: float | None  # m, farthest returns that serve as a ruler; None = all
-    gain: float  # relative error of all depths
-    offset: float  # m, error of all depths
-
-    def scale_sigma(self, depth: float) -> float:
-        """Standard deviation of the sensor's own scale at a depth, relative."""
-        return float(np.hypot(self.gain, self.offset / depth))
-
-
-#: Class → range and accuracy; a stated bound is taken as two standard deviations.
-RANGE_SENSORS: Final = {
-    "unknown": RangeSensor(None, 0.01, 0.005),  # Source: origin not recorded
-    "iphone_lidar": RangeSensor(4.0, 0.005, 0.010),  # Source: G. Luetzenburg et al., Sci. Rep. 11, 2021: 1 cm
-    "realsense_d4xx": RangeSensor(3.0, 0.010, 0.0),  # Source: Intel's data sheet: 2 % at 2 m
-    "kinect_v1": RangeSensor(3.0, 0.010, 0.005),  # Source: origin not recorded
-    "kinect_v2": RangeSensor(4.0, 0.003, 0.010),  # Source: origin not recorded
-    "azure_kinect": RangeSensor(3.8, 0.0005, 0.0055),  # Source: Microsoft's data sheet: 11 mm + 0.1 %
-    "hololens": RangeSensor(3.5, 0.010, 0.010),  # Source: origin not recorded
-}
+#: Relative standard deviation of the scale of a sensor of no stated class. Source: derived, the default ``sigma_rel`` of
+#: a return in :func:`dhtorch.stages.backproject.backproject`.
+_UNSTATED_SENSOR_SIGMA = 0.01
 
 #: Longer side of the pictures that are compared, px. Source: origin not recorded.
 _COMPARED_PX = 320
@@ -179,7 +160,7 @@ def metric_scale(
     frames: Recording | Sequence[Frame],
     *,
     names: Sequence[str] | None = None,
-    sensor: str | RangeSensor = "unknown",
+    sensor: str | Sequence[float] | None = None,
     cutoff: float | None = None,
     options: ScaleOptions = DEFAULT_SCALE_OPTIONS,
 ) -> ScaleResult:
@@ -189,9 +170,10 @@ def metric_scale(
         model: a reconstruction, or its path.
         frames: RGB-D frames (batch size 1); their poses are used where they have them.
         names: of the frames' pictures, to find the model's views by name. None = as the recording's files are called.
-        sensor: class of the depth sensor, see :data:`RANGE_SENSORS`, or its accuracy: an error that all of its returns
-            share is invisible here and enters sigma as stated.
-        cutoff: m; farther returns are not used. None = the class's range.
+        sensor: class of the depth sensor or three numbers (:func:`dhtorch.geometry.sensor_noise.get_sensor_noise`): an
+            error that all returns share is not observable, and the noise of one return enters sigma as if it were such.
+            None = not stated, 1 %.
+        cutoff: m; farther returns are not used. None = all are.
         options: how to measure.
 
     Returns:
@@ -202,13 +184,11 @@ def metric_scale(
         ValueError: no view of the model can be matched with a frame, or too few returns lie on the model.
     """
     model = model if isinstance(model, SceneModel) else read_model(model)
-    ruler = RANGE_SENSORS[sensor] if isinstance(sensor, str) else sensor
-    limit = ruler.reach if cutoff is None else cutoff
     names = list(names) if names is not None else _picture_names(frames)
     matches, notes = _match_views(model, frames, names, options)
     pairs, used = [], []
     for match in matches:
-        measured = _measure(model, model.views[match.view], frames[match.frame], match, limit, options)
+        measured = _measure(model, model.views[match.view], frames[match.frame], match, cutoff, options)
         if measured is not None:
             pairs.append(measured)
             used.append(match)
@@ -225,7 +205,7 @@ def metric_scale(
     if len(used) < _MIN_FRAMES:
         notes.append(f"only {len(used)} view(s) matched: a bend or a drift of the model would not be seen")
     bend = max((abs(g.change) for g in gradients if abs(g.change) > g.sigma), default=0.0)
-    terms = {"frames": scatter, "sensor": ruler.scale_sigma(float(np.median(local.depth))), "model": bend / 12**0.5}
+    terms = {"frames": scatter, "sensor": _sensor_sigma(sensor, float(np.median(local.depth))), "model": bend / 12**0.5}
     result = ScaleResult(
         scale=float(np.exp(mean)),
         sigma=float(np.sqrt(sum(term**2 for term in terms.values()))),
@@ -240,6 +220,13 @@ def metric_scale(
         notes=notes,
     )
     return _place(result, model, frames, pairs)
+
+
+def _sensor_sigma(sensor: str | Sequence[float] | None, depth: float) -> float:
+    """Relative standard deviation of a sensor's own scale at a depth, m."""
+    if sensor is None:
+        return _UNSTATED_SENSOR_SIGMA
+    return float(get_sensor_noise(sensor)(torch.tensor(depth, dtype=torch.float64))) / depth
 
 
 # ------------------------------------------------------------------------------------------------------------ matching

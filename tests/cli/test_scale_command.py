@@ -62,7 +62,7 @@ def test_a_drifting_model_is_refused(capture, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--sensor", "sonar"], "sensor: found 'sonar', expected one of unknown"),
+        (["--sensor", "sonar"], "sensor: found 'sonar', expected one of iphone_lidar"),
         (["--frame", "sky"], "frame: found 'sky'"),
         (["--out", "."], "out: found the model's own folder"),
         (["--tolerance", "-1"], "tolerance: found -1"),

@@ -34,8 +34,9 @@ from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
+from dhtorch.geometry.sensor_noise import SENSORS, SensorNoise
 from dhtorch.measure.models import ModelView, SceneModel, Similarity
-from dhtorch.measure.scale import RANGE_SENSORS, RangeSensor, metric_scale
+from dhtorch.measure.scale import metric_scale
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Frame
@@ -60,6 +61,9 @@ _METRICS = tuple(MainMetric(name, larger_is_better=larger) for name, (_, larger)
 
 #: Faults in the order of the rows: relative changes of scale that are planted, beside ``sound``.
 FAULTS = ("drift", "bend", "frames", "range", "region")
+
+#: Noise of a sensor of whose depths the model itself is made: its own errors cancel.
+_EXACT_SENSOR = SensorNoise(0.0, 0.0, 1e-9)
 
 #: Side of the grid of true depth from which a model is made, px of the longer side. Source: origin not recorded.
 _MODEL_PX = 160
@@ -405,14 +409,14 @@ def _seed(*parts: object) -> int:
 def measure_scale(scene: ScaleScene, kind: str, fault: str | None, size: float, near: float, seed: int) -> Row:
     """One model of a scene -> its error of scale, that at three times the near limit, and whether it is refused."""
     draw = np.random.default_rng([seed, 1])
-    ruler = RANGE_SENSORS["iphone_lidar"] if scene.is_exact else RangeSensor(None, 0.0, 0.0)
-    error, offset = (float(x) for x in draw.normal(size=2) * (ruler.gain, ruler.offset))
-    frames = [f.replace(depth=torch.where(f.depth > 0, f.depth * (1 + error) + offset, 0.0)) for f in scene.frames]
+    sensor = SENSORS["iphone_lidar"] if scene.is_exact else _EXACT_SENSOR
+    error = float(draw.normal())  # in standard deviations of a return, common to all
+    frames = [f.replace(depth=f.depth + error * sensor(f.depth)) for f in scene.frames]
     model, true = make_scale_model(scene, kind, fault, size, near=near, seed=seed)
     names = [view.name for view in model.views]
-    result = metric_scale(model, frames, names=names, sensor=ruler, cutoff=near)
+    result = metric_scale(model, frames, names=names, sensor=sensor, cutoff=near)
     off = float(np.log(result.scale / true))
-    own = np.log(1 + error + offset / float(np.median(result.local.depth)))
+    own = np.log1p(error * result.terms["sensor"])
     row: Row = {"refused": float(not result.ok), "scale_error": abs(off), "sigma": result.sigma}
     row |= {"error_without_sensor": abs(off - float(own))}
     row |= {"within_2sigma": float(abs(off) <= 2 * result.sigma), "within_sigma": float(abs(off) <= result.sigma)}
