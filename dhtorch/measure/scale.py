@@ -49,8 +49,8 @@ from dhtorch.stages.track import lucas_kanade
 
 _Chosen = TypeVar("_Chosen")
 
-#: Relative standard deviation of the scale of a sensor of no stated class. Source: derived, the default ``sigma_rel`` of
-#: a return in :func:`dhtorch.stages.backproject.backproject`.
+#: Relative standard deviation of the scale of a sensor of no stated class. Source: derived, the default ``sigma_rel``
+#: of a return in :func:`dhtorch.stages.backproject.backproject`.
 _UNSTATED_SENSOR_SIGMA = 0.01
 
 #: Longer side of the pictures that are compared, px. Source: origin not recorded.
