@@ -128,7 +128,8 @@ def _format_lines(root: Path, result: ScaleResult) -> list[str]:
     n = len(result.matches)
     if result.faults:
         lines += [f"{root.name}: refused. No single scale fits it ({n} views compared):"]
-        return lines + [f"  {fault}" for fault in _distinct(result.faults)]
+        lines += [f"  {fault}" for fault in _distinct(result.faults)]
+        return [*lines, "  a sensor that is itself off at places looks the same: --tolerance accepts changes up to it"]
     lines += [f"{root.name}: 1 unit = {result.scale:.6g} m ± {half:.1%} (k = 2; {n} views; sigma: {terms})"]
     if result.trajectory_scale is not None:
         scale, sigma = result.trajectory_scale

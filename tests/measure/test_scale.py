@@ -34,6 +34,22 @@ def test_a_bent_model_is_refused_with_where_and_how_much(kind, fault):
     assert {f.kind for f in result.faults} & (along_the_recording if fault != "region" else {"place"})
 
 
+def test_a_model_of_reversed_depth_is_refused():
+    """Near and far exchanged about a plane, as bundle adjustment of a narrow path can make them."""
+    model, _ = made.room_model("maps")
+    far = max(view.depth.max() for view in model.views)
+    views = [replace(v, depth=np.where(v.depth > 0, 1.3 * far - v.depth, 0.0)) for v in model.views]
+    assert {"range"} <= {fault.kind for fault in measure(SceneModel(views)).faults}
+
+
+def test_the_sensor_enters_sigma_as_stated():
+    model, _ = made.room_model("maps")
+    unstated, phone = measure(model), measure(model, sensor="iphone_lidar")
+    depth = np.median(phone.local.depth)
+    assert unstated.terms["sensor"] == 0.01 and phone.terms["sensor"] == pytest.approx(0.01 / depth)
+    assert unstated.scale == phone.scale and unstated.sigma != phone.sigma
+
+
 def test_cameras_place_the_model_in_the_world_of_the_capture():
     model, true = made.room_model("maps")
     result = measure(model)
