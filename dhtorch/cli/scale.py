@@ -185,7 +185,8 @@ def _plots(result: ScaleResult) -> list[tuple[str, bytes]]:
 def _plot(label: str, rows: list[tuple[float, float, float]]) -> bytes:
     rows = [row for row in rows if np.isfinite(row[1])]
     reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma, 0.0)]
-    x, y = fit_axis([row[0] for row in rows], label), fit_axis(reach, "difference, %", percent=True)
+    x = fit_axis([row[0] for row in rows], label)
+    y = fit_axis(reach, "difference, %", percent=True)
     panel = Panel("", x, y, size=(420, 216))
     panel.line([x.low, x.high], [0.0, 0.0], Stroke(FAINT))
     for at, value, sigma in rows:

@@ -232,7 +232,8 @@ def _gradients(kind: str, where: str, x: np.ndarray, bent: str, where_bent: str,
 
 def _part(kind: str, where: str, inside: np.ndarray, local: LocalScales) -> Iterator[_Contrast]:
     """The contrast of a part with enough local scales in it, from at least three frames, and outside of it."""
-    n, frames = inside.sum(), len(np.unique(local.frame[inside]))
+    n = inside.sum()
+    frames = len(np.unique(local.frame[inside]))
     if n >= MIN_RATIOS and frames >= min(3, local.frame.max() + 1) and n <= 0.7 * len(inside):
         yield _Contrast(kind, where, inside.astype(float), is_part=True)
 

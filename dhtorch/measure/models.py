@@ -177,8 +177,9 @@ def _read_colmap(folder: Path, suffix: str, pictures: Path | None) -> SceneModel
         lens, known = lenses[camera], np.array([k in index for k in seen.tolist()], bool)
         w2c = convert.to_c2w(pose.values[None, [1, 2, 3, 0]], pose.values[None, 4:], folder, f"pose of {name}")[0]
         point = np.array([index[k] for k in seen[known].tolist()], np.int64)
-        picture, c2w = _find_picture(folder, name, pictures), np.linalg.inv(w2c)
-        views.append(ModelView(name, lens.K, lens.hw, c2w, lens.distortion, picture, None, point, uv[known] - 0.5))
+        picture = _find_picture(folder, name, pictures)
+        c2w = np.linalg.inv(w2c)
+        views.append(ModelView(name, lens.K, lens.hw, c2w, lens.distortion, picture, point=point, uv=uv[known] - 0.5))
 
     def save(out: Path, similarity: Similarity) -> None:
         poses = [_move_w2c(pose, similarity) for _, _, pose, _, _ in images]
@@ -260,17 +261,20 @@ _Image = tuple[str, int, _Numbers, np.ndarray, np.ndarray]
 
 
 def _binary_images(file: Path, data: bytes) -> Iterator[_Image]:
-    cursor, observation = _Cursor(file, data), np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+    cursor = _Cursor(file, data)
+    observation = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
     for _ in range(cursor.take("Q")[0]):
         cursor.take("I")
         pose = _Numbers(cursor.at, np.array(cursor.take("7d")))
-        camera, name = cursor.take("I")[0], cursor.text()
+        camera = cursor.take("I")[0]
+        name = cursor.text()
         seen = cursor.array(observation, cursor.take("Q")[0])
         yield name, camera, pose, seen["uv"], seen["point"]
 
 
 def _binary_points(file: Path, data: bytes) -> Iterator[tuple[int, _Numbers]]:
-    cursor, track = _Cursor(file, data), np.dtype("<u8")
+    cursor = _Cursor(file, data)
+    track = np.dtype("<u8")
     for _ in range(cursor.take("Q")[0]):
         number = cursor.take("Q")[0]
         place = _Numbers(cursor.at, np.array(cursor.take("3d")))
@@ -404,7 +408,8 @@ def _read_splat(file: Path, pictures: Path | None) -> SceneModel:
         c2w[:3, :3] = files.to_array(values.get("rotation"), (3, 3), source, f"{k}.rotation")
         c2w[:3, 3] = files.to_array(values.get("position"), (3,), source, f"{k}.position")
         name = str(values.get("img_name", k))
-        K, image = convert.make_K(fx, fy, w / 2 - 0.5, h / 2 - 0.5), _find_picture(source.parent, name, pictures)
+        K = convert.make_K(fx, fy, w / 2 - 0.5, h / 2 - 0.5)
+        image = _find_picture(source.parent, name, pictures)
         views.append(ModelView(name, K, (round(h), round(w)), c2w, None, image))
     names = vertices.vertex.dtype.names or ()
     xyz = vertices.xyz[vertices.vertex["opacity"] > 0] if "opacity" in names else vertices.xyz
@@ -504,7 +509,7 @@ def _views_of_arrays(
             z[conf[k] < np.quantile(conf[k], _LEAST_CONFIDENT_SHARE)] = 0
         name = f"{k:06d}" if names is None else names[k]
         image = name if isinstance(name, Path) else _find_picture(archive.parent, Path(name).name, None)
-        yield ModelView(Path(name).name, K[k], (z.shape[0], z.shape[1]), c2w[k], None, image, z)
+        yield ModelView(Path(name).name, K[k], (z.shape[0], z.shape[1]), c2w[k], image=image, depth=z)
 
 
 def _write_arrays(archive: Path, out: Path, similarity: Similarity) -> None:

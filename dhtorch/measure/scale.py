@@ -339,7 +339,8 @@ def _measure(
         return None
     if match.is_same:
         at = _same_pixels(view, frame, uv)
-        samples, identity = _returns(frame, at, limit, options), np.eye(4)
+        samples = _returns(frame, at, limit, options)
+        identity = np.eye(4)
         depth, ok = samples.depth[0], _is_clean(samples)
         return _select(view, uv, depth, model_depth, ok, identity)
     return _measure_by_tracks(view, frame, uv, model_depth, limit, options)
@@ -355,7 +356,8 @@ def _model_depths(model: SceneModel, view: ModelView, n: int) -> tuple[Tensor, T
     seen = slice(None) if view.point is None else view.point
     xyz = model.xyz[seen]
     local = (xyz - view.c2w[:3, 3]) @ view.c2w[:3, :3]
-    z, camera = torch.from_numpy(local[:, 2]), _camera_of(view)
+    z = torch.from_numpy(local[:, 2])
+    camera = _camera_of(view)
     if view.uv is None:
         uv = cam.project(cam.ideal(camera), torch.from_numpy(np.where(local[:, 2:] > 0, local, 1.0))[None])
         uv = cam.distort(camera, uv)[0]
@@ -432,7 +434,8 @@ def _measure_by_tracks(
         valid = tracks.valid & _is_clean(samples)[None]
         if int(valid.sum()) < _MIN_TRACKS:
             return None
-        camera, draws = _camera_of(view), torch.rand(1, 128, 3, generator=torch.Generator().manual_seed(0)).double()
+        camera = _camera_of(view)
+        draws = torch.rand(1, 128, 3, generator=torch.Generator().manual_seed(0)).double()
         ideal = cam.undistort(camera, uv[None])
         back = Tracks(tracks.uv_1, ideal, tracks.error, tracks.photometric, tracks.cov, valid)
         fit = pnp_ransac(samples, back, frame.camera, cam.ideal(camera), draws, threshold_px=2.0)
