@@ -50,6 +50,7 @@ EXPERIMENTS = {
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.reference_views=3",
     "uncertainty_study": "experiment=uncertainty_study data=shared_scenes",
+    "uncertainty_study_streams": "experiment=uncertainty_study data=streams ~experiment.rooms",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
     "field_study": "experiment=field_study",
     "validate_study": "experiment=validate_study data=shared_scenes",
