@@ -568,6 +568,42 @@ def validated_real() -> str:
     return table(["capture", "frames", "wrong, of validated pixels", "unknown", "likely cause (windows)"], rows)
 
 
+#: What a pinned camera is to reach, in words, and its bars.
+PINNED = {
+    "false_alarms": ("false alarms, camera stands still, three lights", "≤ 0.01"),
+    "unknown": ("cannot know, all pictures", ""),
+    "found_0.5px": ("found: shift of 0.5 px at the median point of the scene", ""),
+    "found_1px": ("1 px", ""),
+    "found_2px": ("2 px", "≥ 0.95"),
+    "found_5px": ("5 px", ""),
+    "found_20px": ("20 px", ""),
+    "found_60px": ("60 px", ""),
+    "found_0.1deg": ("found: turn of 0.1°", ""),
+    "found_0.5deg": ("0.5°", ""),
+    "found_1deg": ("1°", ""),
+    "found_2deg": ("2°", ""),
+    "found_5deg": ("5°", ""),
+    "error_mm_half": ("offset, half hidden: median error, mm", "≤ 2"),
+    "error_deg_half": ("degrees", "≤ 0.1"),
+    "within_1sigma_half": ("its six components within one sigma", "0.68 ± 0.07"),
+    "within_2sigma_half": ("within two", "≥ 0.92"),
+    "within_1sigma_all": ("all moved pictures: within one sigma", ""),
+    "within_2sigma_all": ("within two", ""),
+    "time_ratio": ("time of a picture, ratio to one pair of `map`", "≤ 1.5"),
+    "time_ratio_half": ("the same, half hidden", ""),
+    "gr00t_demo_moved": ("`gr00t_demo`: episodes moved by more than 2 px, of 10", "0"),
+    "lerobot_g1_moved": ("`lerobot_g1`: episodes moved by more than 8 px, of 6", "0"),
+    "lerobot_g1_turned": ("its sway reported as rotation alone, of what is known", ""),
+}
+
+
+def pinned() -> str:
+    """What a pinned camera reaches, beside its bars."""
+    summary = json.loads((RESULTS / "pin_study.json").read_text())["summary"]
+    rows = [[words, f"{summary[f'pin.{name}']['value']:.3f}", bar] for name, (words, bar) in PINNED.items()]
+    return table(["number", "`pin_study`", "bar"], rows)
+
+
 #: What alignment is to reach, in words, and its bars.
 ALIGNED = {
     "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
@@ -710,6 +746,7 @@ TABLES |= {"kornia twin": twin, "track chain": chained}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {
     "validate": validated,
+    "pin": pinned,
     "validate real": validated_real,
     "lerobot train": lerobot_trained,
     "scale": scaled,

@@ -57,6 +57,7 @@ EXPERIMENTS = {
     "validate_study_streams": "experiment=validate_study data=streams experiment.rooms=[]",
     "validate_study_unseen": "experiment=validate_study data=synthetic_seeds "
     "data.seed=[25,26,27,28,29] data.n_frames=30 experiment.rooms=[]",
+    "pin_study": "experiment=pin_study",
     "dense_streams": "experiment=dense_comparison data=streams experiment.reference_views=6 experiment.rooms=[]",
     "align_study": "experiment=align_study data=shared_scenes",
     "align_study_streams": "experiment=align_study data=streams",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dhtorch.alignment.align import align_depth
+    from dhtorch.measure import CameraPin, PinResult
     from dhtorch.pipeline.completion import complete_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
@@ -45,12 +46,14 @@ __all__ = [
     "PAPER",
     "WINDOW",
     "Camera",
+    "CameraPin",
     "DepthValidation",
     "Estimate",
     "ExtendDepth",
     "Frame",
     "MergedDepth",
     "Method",
+    "PinResult",
     "Pose",
     "PoseFit",
     "Samples",
@@ -69,8 +72,10 @@ __all__ = [
 #: Public name → module that defines it, if that is not ``records``.
 _HOMES = dict.fromkeys(("AUTO", "FUSED", "KORNIA", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
 _HOMES |= {
+    "CameraPin": "measure",
     "ExtendDepth": "transforms",
     "Method": "pipeline.method",
+    "PinResult": "measure",
     "Stream": "pipeline.stream",
     "ValidateDepth": "transforms",
     "align_depth": "alignment.align",

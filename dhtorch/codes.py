@@ -201,6 +201,24 @@ class State(CodeTable):
     WRONG: Final = code(2, "contradicted by evidence, and supported by none")
 
 
+class PinVerdict(CodeTable):
+    """Codes of ``PinResult.verdict``."""
+
+    NOT_MOVED: Final = code(0, "the camera stands where it stood, as far as the picture can tell")
+    MOVED: Final = code(1, "the camera was moved")
+    CANNOT_KNOW: Final = code(2, "the picture does not determine where the camera stands")
+
+
+class PinReason(CodeTable):
+    """Codes of ``PinResult.reason``: why a picture does not determine where the camera stands."""
+
+    ANSWERED: Final = code(0, "answered")
+    NO_TRACKS: Final = code(1, "hardly anything of the reference was found: covered, dark, or another view")
+    NO_AGREEMENT: Final = code(2, "what was found does not move as one: little background, or another scene")
+    ONE_PLACE: Final = code(3, "what agrees lies in one part of the picture")
+    UNCERTAIN: Final = code(4, "the shift is not known to a pixel")
+
+
 class WrongCause(CodeTable):
     """Codes of the causes of wrong pixels of a validated depth map."""
 

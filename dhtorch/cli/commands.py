@@ -333,6 +333,33 @@ COMMANDS: dict[str, Command] = {
         ("out", "images", "sensor", "cutoff", "frame", "max_frames", "tolerance", "fov", "depth_unit"),
         exit_line="Exit code: 0 done, 1 the model is refused, 2 bad option or bad data, 130 interrupted.",
     ),
+    "pin": Command(
+        _CHECKS,
+        "was a camera moved, when and by how much? A reference against pictures or episodes",
+        "REF SOURCE",
+        "Compares pictures with a reference view of a fixed camera: offset in mm and degrees with sigma, shift in "
+        "px, and moved, not moved or cannot know at a stated rate of false alarms. Robots and objects that move or "
+        "hide the scene are left out; only REF needs depth. Writes pin.json and pin.html, worst first.",
+        (
+            ("REF SET", "the first recording of REF against every episode of a data set"),
+            ("REF picture.png --fail-on 'moved>2px'", "exit code 1 where the camera moved"),
+            ("REF 0 --guide", "a live camera: which way to push the mount"),
+        ),
+        (
+            "fail_on",
+            "guide",
+            "out",
+            "max_frames",
+            "every",
+            "ref_frames",
+            "false_alarm_rate",
+            "device",
+            "fov",
+            "K",
+            "camera",
+        ),
+        exit_line=_LIMIT_EXIT_LINE,
+    ),
     "run": Command(
         _STUDIES,
         "an experiment with hidden depth as ground truth, or a sweep",

@@ -47,6 +47,7 @@ _CONFIGURED_COMMANDS = {
     "enrich": "dhtorch.cli.enrich",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
+    "pin": "dhtorch.cli.pin",
     "recover": "dhtorch.cli.process_capture",
     "scale": "dhtorch.cli.scale",
     "stream": "dhtorch.cli.stream",
@@ -58,6 +59,7 @@ _CONFIGURED_COMMANDS = {
 _POSITIONAL_OPTIONS = {
     **dict.fromkeys(("align", "complete", "extract", "integrate", "run", "stream", "validate"), ("data.root",)),
     "enrich": ("data.root", "out"),
+    "pin": ("ref", "source"),
     "recover": ("path",),
     "scale": ("model", "data.root"),
     "view": ("result",),
@@ -81,7 +83,7 @@ EXIT_SIGHUP, EXIT_SIGTERM = 129, 143
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
     EXIT_DONE: "all done or left untouched",
-    EXIT_SOME_FAILED: "some jobs of a sweep failed, depth exceeds a limit of fail_on, or a model is refused",
+    EXIT_SOME_FAILED: "some jobs of a sweep failed, a limit of fail_on is exceeded, or a model is refused",
     EXIT_FAILED: "bad option, bad data or failed job",
     EXIT_INTERRUPTED: "interrupted",
     EXIT_SIGHUP: "ended by SIGHUP, e.g. a closed terminal",

@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -91,6 +91,22 @@ class ShadedRoom:
                 turn = k % len(motion.t)
                 solids[i], k = solid.moved(motion[turn : turn + 1]), k + 1
         room.solids = Solids(solids)
+        return room
+
+    def relit(self, factors: Sequence[float], ambient: float) -> ShadedRoom:
+        """The room with the power of its lights times ``factors``, and another ambient light.
+
+        Raises:
+            ValueError: not one factor for each light.
+        """
+        if len(factors) != len(self._lights):
+            raise ValueError(f"shaded room: found {len(factors)} factors for {len(self._lights)} lights")
+        room = copy.copy(self)
+        colours = ((light.colour, k) for light, k in zip(self._lights, factors, strict=True))
+        powers = [(p[0] * k, p[1] * k, p[2] * k) for p, k in colours]
+        room._lights = tuple(replace(light, colour=p) for light, p in zip(self._lights, powers, strict=True))
+        room._ambient = ambient
+        room._furnish(self.solids.each, None)
         return room
 
     def shade(

@@ -48,7 +48,7 @@ def test_the_help_of_a_command_is_short(command, name):
 @pytest.mark.parametrize("name", COMPUTING)
 def test_common_options_have_one_name(name):
     known = list_options(name, run.config_dir())
-    for option in ("max_frames", "every", *(["method"] if name != "scale" else []), "device", "out"):
+    for option in ("max_frames", "every", *(["method"] if name not in ("pin", "scale") else []), "device", "out"):
         assert resolve_option(name, option, known), option
 
 
@@ -103,6 +103,7 @@ def test_a_device_that_torch_cannot_use_is_one_line(command, monkeypatch, name):
         "align": ["align", ".", "depth=.", "out=o"],
         "complete": ["complete", ".", "out=o"],
         "scale": ["scale", ".", "."],
+        "pin": ["pin", ".", "."],
     }
     words |= {
         "enrich": ["enrich", ".", "o"],

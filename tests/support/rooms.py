@@ -2,9 +2,15 @@
 
 from functools import cache
 
+import torch
+
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.geometry import se3
+from dhtorch.pytree import collate
+from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.synthetic.recording import SyntheticRoom, room_to_scene
+from dhtorch.testing.layouts import write_tum
 
 
 @cache
@@ -34,3 +40,15 @@ class Changed(SyntheticRoom):
 def untold(room) -> Recording:
     """The recording of a room without its truth."""
     return Recording(name=room.name, format="made", load=room.__getitem__, number=room.number, poses=room.poses)
+
+
+def moved_camera_capture(root):
+    """A capture at ``root`` whose camera stands still, and elsewhere from its frame 4 of 8 on; the path and the frames."""
+    here = hand_held_path("static", 1, step_m=0.0, rate_hz=30.0, seed=3)
+    there = se3.compose(here, se3.exp(torch.tensor([[0.02, -0.03, 0.01, 0.02, 0.01, 0.03]], dtype=torch.float64)))
+    poses = collate([*[here] * 4, *[there] * 4])
+    options = {"hw": (120, 160), "depth_hw": (120, 160), "n_frames": 8, "seed": 3, "true_poses": poses}
+    recording = SyntheticRoom(supersample=1, **options)  # poses cannot be a key of the cache
+    frames = [recording[i] for i in range(8)]
+    write_tum(root, frames)
+    return root, frames

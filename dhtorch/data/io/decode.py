@@ -14,7 +14,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -283,6 +283,25 @@ def _decode_with_opencv(file: Path, data: bytes, flags: int, hw: tuple[int, int]
     if image is None or image.shape[:2] != tuple(hw):
         raise FormatError(file, "data", "undecodable pixels", f"an image of {_format_size(hw)}")
     return image
+
+
+def read_live_camera(index: int) -> Iterator[np.ndarray]:
+    """Pictures (3, H, W) uint8, RGB, of OpenCV's camera ``index`` until it gives no more.
+
+    Raises:
+        FormatError: no such camera.
+    """
+    capture = cv2.VideoCapture(index)
+    try:
+        if not capture.isOpened():
+            raise FormatError(Path(str(index)), "camera", "none that opens", "the number of a camera of OpenCV")
+        while True:
+            ok, picture = capture.read()
+            if not ok:
+                return
+            yield np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).transpose(2, 0, 1))
+    finally:
+        capture.release()
 
 
 # ------------------------------------------------------------------------------------------------------------ text

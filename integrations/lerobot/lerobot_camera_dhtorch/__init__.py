@@ -3,6 +3,7 @@
 from lerobot_camera_dhtorch.camera import DhtorchCamera
 from lerobot_camera_dhtorch.config_dhtorch import DhtorchCameraConfig
 from lerobot_camera_dhtorch.steps import (
+    CameraPinStep,
     ExtendDepthStep,
     GeometryImageStep,
     MaskSilenceStep,
@@ -12,6 +13,7 @@ from lerobot_camera_dhtorch.steps import (
 )
 
 __all__ = [
+    "CameraPinStep",
     "DhtorchCamera",
     "DhtorchCameraConfig",
     "ExtendDepthStep",

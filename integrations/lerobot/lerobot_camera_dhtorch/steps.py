@@ -18,10 +18,10 @@ from lerobot.configs.types import FeatureType, PipelineFeatureType, PolicyFeatur
 from lerobot.processor import DataProcessorPipeline, ProcessorStep, ProcessorStepRegistry, TransitionKey
 from torch import Tensor
 
-from dhtorch import ExtendDepth
+from dhtorch import CameraPin, ExtendDepth
 from dhtorch.functional import geometry_image, point_cloud
 from dhtorch.geometry.camera import resize, to_matrix
-from dhtorch.records import Camera
+from dhtorch.records import Camera, Frame
 from dhtorch.transforms import SampleError, SampleSpec, ValidateDepth, declared_depth_unit
 from lerobot_camera_dhtorch.window import FrameWindow
 
@@ -420,6 +420,71 @@ class PointCloudStep(_DepthStep):
 
     def _added(self, known: Mapping[str, PolicyFeature]) -> Shapes:
         return {self.config["to"]: (FeatureType.STATE, (self.config["n"], 3))}
+
+
+@ProcessorStepRegistry.register("dhtorch_camera_pin")
+class CameraPinStep(_DepthStep):
+    """Adds whether a fixed camera was moved since a reference view, and by how much (:class:`dhtorch.CameraPin`).
+
+    ``observation.dh_pin_verdict`` (B,) is a code of :class:`dhtorch.codes.PinVerdict`, ``…_shift_px`` and
+    ``…_shift_sigma_px`` (B,), ``…_offset`` (B, 6) rad and m; NaN where the picture cannot tell. The reference is part
+    of the step's state, so a saved preprocessor holds it.
+
+    Args:
+        image: key of the camera's picture.
+        intrinsics: fx, fy, cx, cy of it, px.
+        max_px: shift, less two sigmas, above which a picture is an error instead of an observation; None = never.
+        false_alarm_rate: of *moved* for a camera that stands still.
+    """
+
+    def __init__(
+        self,
+        *,
+        image: str,
+        intrinsics: Sequence[float],
+        max_px: float | None = None,
+        false_alarm_rate: float = 0.01,
+    ) -> None:
+        numbers = [float(x) for x in intrinsics]
+        super().__init__(image=image, intrinsics=numbers, max_px=max_px, false_alarm_rate=false_alarm_rate)
+        self.pin: CameraPin | None = None
+
+    def set_reference(self, image: Tensor, depth: Tensor | None = None) -> None:
+        """The view of the camera in its place: picture (C, H, W) or (1, C, H, W), and depth in m where there is one."""
+        image = image[None] if image.dim() == 3 else image
+        depth = torch.zeros_like(image[:, 0], dtype=torch.float32) if depth is None else _map(depth.float())
+        numbers = torch.tensor([self.config["intrinsics"]])
+        frame = Frame(image.cpu(), depth.reshape(1, *depth.shape[-2:]).cpu(), Camera(numbers[:, :2], numbers[:, 2:]))
+        self.pin = CameraPin(frame, false_alarm_rate=self.config["false_alarm_rate"])
+
+    def _process(self, transition: Any) -> Any:
+        if self.pin is None:
+            raise SampleError("dhtorch_camera_pin: found no reference, expected set_reference or a saved state")
+        observation = transition[TransitionKey.OBSERVATION]
+        image = torch.as_tensor(observation[self.config["image"]])
+        result = self.pin.check((image[None] if image.dim() == 3 else image).cpu())
+        limit, low = self.config["max_px"], result.shift_low_px
+        if limit is not None and bool((low > limit).any()):
+            raise SampleError(
+                f"{self.config['image']}: camera moved by at least {float(low.max()):.1f} px, limit {limit:g}"
+            )
+        values = {"verdict": result.verdict, "offset": result.offset.float()}
+        values |= {"shift_px": result.shift_px.float(), "shift_sigma_px": result.shift_sigma_px.float()}
+        observation.update({f"{PREFIX}pin_{name}": value.to(image.device) for name, value in values.items()})
+        return transition
+
+    def _added(self, known: Mapping[str, PolicyFeature]) -> Shapes:
+        shapes = {"verdict": (), "offset": (6,), "shift_px": (), "shift_sigma_px": ()}
+        return {f"{PREFIX}pin_{name}": (FeatureType.STATE, shape) for name, shape in shapes.items()}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Picture and depth of the reference."""
+        return {} if self.pin is None else {"image": self.pin.frame.image, "depth": self.pin.frame.depth}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """State of :meth:`state_dict`."""
+        if "image" in state:
+            self.set_reference(state["image"], state["depth"])
 
 
 def _map(x: Any) -> Tensor:

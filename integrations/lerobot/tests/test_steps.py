@@ -15,6 +15,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 register_third_party_plugins()  # nothing here imports the package by name before LeRobot has found it
 from lerobot_camera_dhtorch import (  # noqa: E402
+    CameraPinStep,
     ExtendDepthStep,
     GeometryImageStep,
     MaskSilenceStep,
@@ -84,7 +85,7 @@ def reloaded(pipeline, folder):
 
 
 def test_lerobot_finds_the_steps_and_the_camera():
-    names = {"extend_depth", "validate_depth", "mask_silence", "geometry_image", "point_cloud"}
+    names = {"extend_depth", "validate_depth", "mask_silence", "geometry_image", "point_cloud", "camera_pin"}
     assert {f"dhtorch_{name}" for name in names} <= set(ProcessorStepRegistry.list())
     assert "dhtorch" in CameraConfig.get_known_choices()
 
@@ -250,3 +251,20 @@ def test_pictures_and_points_are_of_the_far_depth():
     assert points.shape == (1, 200, 3) and (uv - uv.round()).abs().max() < 1e-3
     u, v = uv.round().long().T
     assert torch.allclose(depth[0, v, u], points[0, :, 2])
+
+
+def test_a_moved_camera_is_seen_and_the_reference_is_saved(tmp_path):
+    numbers = dataset()[0][K].reshape(3, 3)
+    intrinsics = [float(numbers[0, 0]), float(numbers[1, 1]), float(numbers[0, 2]), float(numbers[1, 2])]
+    step = CameraPinStep(image=IMAGE, intrinsics=intrinsics)
+    with pytest.raises(SampleError, match="no reference"):
+        PolicyProcessorPipeline(steps=[step])(batch(0))
+    step.set_reference(batch(0)[IMAGE], batch(0)[DEPTH])
+    pipeline = reloaded(PolicyProcessorPipeline(steps=[step], name="policy_preprocessor"), tmp_path)
+    still, moved = (pipeline(batch(index)) for index in (0, 4))
+    assert still["observation.dh_pin_verdict"].tolist() == [0] and moved["observation.dh_pin_verdict"].tolist() == [1]
+    assert still["observation.dh_pin_shift_px"] < 0.1 < moved["observation.dh_pin_shift_px"]
+    strict = CameraPinStep(image=IMAGE, intrinsics=intrinsics, max_px=0.5)
+    strict.set_reference(batch(0)[IMAGE], batch(0)[DEPTH])
+    with pytest.raises(SampleError, match="camera moved by at least"):
+        PolicyProcessorPipeline(steps=[strict])(batch(4))

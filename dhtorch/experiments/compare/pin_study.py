@@ -1,0 +1,334 @@
+"""Question: does a reference view tell whether its camera was moved, and by how much?
+
+Expectation (written before the run on the test seeds): a shift of 2 px at the scene's median depth is found in 95 % of
+the pictures, at 1 % false alarms on unmoved pairs at other lights; half occluded, the offset is right to 2 mm and 0.1
+degrees (median), within one stated sigma in 61 to 75 % and within two in 92 % at least.
+What would refute it: any of these numbers missed.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import PinReason, PinVerdict, name
+from dhtorch.data import open_all, scenes_root
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import SceneLike
+from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
+from dhtorch.experiments.rows import Row
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.measure import CameraPin
+from dhtorch.metrics import bootstrap
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import MAP
+from dhtorch.pytree import collate
+from dhtorch.records import Camera, Frame, Pose
+from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
+from dhtorch.synthetic.paths import hand_held_path
+from dhtorch.synthetic.robot import hand_camera_pose
+
+#: Planted shifts of the median point of the scene, px, in scenes of even and of odd seeds.
+SHIFTS_PX = ((0.5, 2.0, 20.0), (1.0, 2.0, 5.0, 60.0))
+
+#: Planted turns about a random axis, degrees, likewise.
+TURNS_DEG = ((0.1, 1.0, 5.0), (0.5, 2.0))
+
+#: Frames of the walk through a room, at one of which the camera is fixed.
+_WALK_FRAMES = 60
+
+#: Shares of the picture that arms hide in the reference and in a live picture.
+_REFERENCE_SHARE, _LIVE_SHARES = 0.15, (0.0, 0.5, 0.6)
+
+#: Runs of each timing; the least counts.
+_TIMED_RUNS = 5
+
+#: Real sets of fixed cameras, and the shift above which their camera counts as moved, px.
+_REAL_SETS = (("gr00t_demo", 2.0), ("lerobot_g1", 8.0))
+
+#: Frames of a real episode that are compared, and the field of view assumed for them, degrees.
+_REAL_FRAMES, _REAL_FOV_DEG = 8, 60.0
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("found_2px", larger_is_better=True),
+    MainMetric("false_alarms", larger_is_better=False),
+    MainMetric("unknown", larger_is_better=False),
+    MainMetric("error_mm_half", larger_is_better=False),
+    MainMetric("error_deg_half", larger_is_better=False),
+)
+
+PIN_QUESTION = "Does a reference view tell whether its camera was moved, and by how much?"
+PIN_EXPECTATION = "Every number of the list of bars is met; scenes are the unit of fractions."
+
+#: Number → (least, largest) value of its bar.
+PIN_BARS: dict[str, tuple[float, float]] = {
+    "pin.found_2px": (0.95, 1.0),
+    "pin.false_alarms": (0.0, 0.01),
+    "pin.error_mm_half": (0.0, 2.0),
+    "pin.error_deg_half": (0.0, 0.1),
+    "pin.within_1sigma_half": (0.61, 0.75),
+    "pin.within_2sigma_half": (0.92, 1.0),
+    "pin.time_ratio": (0.0, 1.5),
+    "pin.gr00t_demo_moved": (0.0, 0.0),
+    "pin.lerobot_g1_moved": (0.0, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class PlantedMove:
+    """One rendered picture of a fixed camera."""
+
+    kind: str  # "shift" (px), "turn" (degrees) or "still"
+    size: float
+    light: str
+    T_ref_from_live: Pose
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class FixedScene:
+    """A reference view of a camera, and pictures before and after moves."""
+
+    name: str
+    reference: Frame
+    pictures: tuple[PlantedMove, ...]
+
+
+def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int = 2) -> FixedScene:
+    """Reference and pictures of a camera in the room of a seed: a view of the ``room``, or of things at a ``robot``."""
+    draw = Random(f"pin {kind} {seed}")
+    if kind == "robot":
+        here = hand_camera_pose(seed % 12, 0, seed, 0.2)
+    else:
+        here = hand_held_path("walk", _WALK_FRAMES, step_m=0.02, rate_hz=30.0, seed=seed)[draw.randrange(_WALK_FRAMES)]
+        here = here.map(lambda x: x[None])
+    options = {"seed": seed, "hw": hw, "supersample": supersample}
+    still = LitRoom(n_frames=1, true_poses=here, **options)
+    depth = still.truth(0)["depth"]
+    wanted = [("shift", size) for size in SHIFTS_PX[seed % 2]] + [("turn", size) for size in TURNS_DEG[seed % 2]]
+    moves = [(name, size, _draw_move(name, size, depth, still.camera, draw)) for name, size in wanted]
+    moves = [("still", 0.0, se3.identity(1, here.t)), *moves]
+    pictures = []
+    for k, light in enumerate(ROOM_LIGHTS):
+        mine = [moves[0], *moves[1 + k :: len(ROOM_LIGHTS)]]
+        poses = collate(se3.compose(here, T) for _, _, T in mine)
+        room = LitRoom(light=light, n_frames=len(mine), true_poses=poses, **options)
+        pictures += [PlantedMove(name, size, light, T, room[i]) for i, (name, size, T) in enumerate(mine)]
+    return FixedScene(f"{kind}_{seed}", pictures[0].frame, tuple(pictures))
+
+
+def _draw_move(kind: str, size: float, depth: Tensor, camera: Camera, draw: Random) -> Pose:
+    """A random motion ``T_ref_from_live`` (1), float64: of ``size`` px at the median point of the scene, or degrees."""
+    turn, shift = (torch.tensor([draw.gauss(0, 1) for _ in range(3)], dtype=torch.float64) for _ in range(2))
+    turn, shift = turn / turn.norm(), shift / shift.norm()
+    if kind == "turn":
+        return se3.exp(torch.cat((turn * math.radians(size), 0 * shift))[None])
+    share = draw.uniform(0.2, 0.8)
+    z = float(depth.median())
+    xi = torch.cat((share * turn, (1 - share) * z * shift))[None] / float(camera.f.mean())
+    scale = size
+    for _ in range(6):
+        scale *= size / max(median_flow(se3.exp(scale * xi), depth, camera), 1e-9)
+    return se3.exp(scale * xi)
+
+
+def median_flow(T_ref_from_live: Pose, depth: Tensor, camera: Camera) -> float:
+    """Median motion, px, of the points of a depth map (1, H, W) of the reference in the live picture."""
+    H, W = depth.shape[-2:]
+    v, u = torch.meshgrid(torch.arange(0, H, 8), torch.arange(0, W, 8), indexing="ij")
+    uv = torch.stack((u, v), -1).reshape(1, -1, 2).double()
+    camera = camera.map(lambda x: x.double())
+    xyz = cam.unproject(camera, uv, depth[:, v, u].reshape(1, -1).double())
+    moved = cam.project(camera, se3.apply(se3.invert(T_ref_from_live), xyz))
+    return float((moved - uv).norm(dim=-1).median())
+
+
+def live_pictures(scene: FixedScene, draws: int) -> Iterator[tuple[PlantedMove, float, Frame]]:
+    """Every rendered picture, taken again ``draws`` times with other exposure, noise and arms: (move, share, frame)."""
+    for move in scene.pictures:
+        for k in range(draws * (3 if move.kind == "still" else 1)):
+            draw = Random(f"{scene.name} {move.kind} {move.size} {move.light} {k}")
+            share = _LIVE_SHARES[k % len(_LIVE_SHARES)]
+            frame, _ = hide_behind_arms(move.frame, share, arm_seed=k % 2, draw=draw)
+            yield move, share, photograph_again(frame, draw)
+
+
+def reference_frame(scene: FixedScene) -> Frame:
+    """The reference with arms over a part of it, as a robot stands in its camera's view."""
+    draw = Random(f"{scene.name} reference")
+    return hide_behind_arms(scene.reference, _REFERENCE_SHARE, arm_seed=0, draw=draw)[0]
+
+
+def run(
+    _scenes: Sequence[SceneLike],
+    _chosen: Mapping[str, Method],
+    _pairs: ScenePairs,
+    settings: Settings,
+    *,
+    rooms: Sequence[int],
+    robots: Sequence[int],
+    draws: int = 4,
+    hw: Sequence[int] = (480, 640),
+    real: bool = True,
+    root: str | None = None,
+    progress: Progress = no_progress,
+) -> Outcome:
+    """Verdicts and offsets of planted moves, of cameras that stand still, and of real fixed cameras.
+
+    Args:
+        rooms, robots: seeds of the scenes, each at its own place; thresholds were chosen on others.
+        draws: live pictures of each rendered one, with other exposure, response, noise and arms; three times as many of
+            a camera that stands still.
+        hw: size of the pictures.
+        real: also compare the episodes of ``gr00t_demo`` and ``lerobot_g1``.
+        root: folder of the shared data; None = the environment variable ``DHTORCH_DATA``.
+
+    Rows: one per live picture, one per real episode. In the summary, fractions are means over scenes with intervals
+    over scenes; ``half`` are pictures half hidden by arms; errors and coverage of sigma are over pictures of moved
+    cameras, the coverage of the six components of the offset.
+    """
+    outcome = Outcome(metrics=_METRICS)
+    times: list[dict[str, float]] = []
+    places = [*(("room", seed) for seed in rooms), *(("robot", seed) for seed in robots)]
+    for kind, seed in progress(places, "scenes", len(places)):
+        scene = render_scene(kind, seed, (hw[0], hw[1]))
+        pin = CameraPin(reference_frame(scene), seed=settings.seed)
+        outcome.rows += [_picture_row(scene, pin, *picture) for picture in live_pictures(scene, draws)]
+        times.append(_time_ratio(scene, pin))
+        outcome.n_pairs = len(outcome.rows)
+    if real:
+        outcome.rows += _real_rows(scenes_root(root))
+    outcome.summary = summarise_pin(outcome.rows, times)
+    return outcome.decide(PIN_QUESTION, PIN_EXPECTATION, *pin_verdict(outcome.summary))
+
+
+def _picture_row(scene: FixedScene, pin: CameraPin, move: PlantedMove, share: float, frame: Frame) -> Row:
+    """One live picture -> row with the verdict and, where there is one, the error of the offset."""
+    result = pin.check(frame.image)
+    row: Row = {"scene": scene.name, "pair": [0, 0], "method": "pin", "truth": None, "kind": move.kind}
+    row |= {"size": move.size, "light": move.light, "hidden": share}
+    row |= {
+        "verdict": name(PinVerdict, int(result.verdict)).lower(),
+        "reason": name(PinReason, int(result.reason)).lower(),
+    }
+    if int(result.verdict) == PinVerdict.CANNOT_KNOW:
+        return row
+    error = se3.log(se3.compose(result.T_ref_from_live, se3.invert(move.T_ref_from_live)))[0]
+    sigmas = error / result.cov[0].diagonal().sqrt()
+    row |= {"shift_px": float(result.shift_px), "sigma_px": float(result.shift_sigma_px)}
+    row |= {"error_mm": 1e3 * float((result.T_ref_from_live.t - move.T_ref_from_live.t).norm())}
+    row |= {"error_deg": math.degrees(float(error[:3].norm())), "sigmas": sigmas.tolist()}
+    return row
+
+
+def _time_ratio(scene: FixedScene, pin: CameraPin) -> dict[str, float]:
+    """Time of one picture over that of one pair of the method ``map``, the least of alternating runs: plain and half
+    hidden."""
+    moved = next(move for move in scene.pictures if move.kind == "shift")
+    draw = Random(f"{scene.name} time")
+    pictures = {
+        "time_ratio": moved.frame,
+        "time_ratio_half": hide_behind_arms(moved.frame, 0.5, arm_seed=1, draw=draw)[0],
+    }
+    best = dict.fromkeys([*pictures, "map"], math.inf)
+    for _ in range(_TIMED_RUNS):
+        for key, frame in pictures.items():
+            start = time.perf_counter()
+            pin.check(frame.image)
+            best[key] = min(best[key], time.perf_counter() - start)
+        start = time.perf_counter()
+        MAP(scene.reference, moved.frame)
+        best["map"] = min(best["map"], time.perf_counter() - start)
+    return {key: best[key] / best["map"] for key in pictures}
+
+
+def _real_rows(root: Path) -> list[Row]:
+    """Episodes of real fixed cameras: a row each, against the set's first episode and against its own first frames."""
+    rows: list[Row] = []
+    for data, _ in _REAL_SETS:
+        recordings = open_all(root / data, fov=_REAL_FOV_DEG)
+        first = CameraPin(_spread_frames(recordings[0], _REAL_FRAMES))
+        for recording in recordings:
+            frames = _spread_frames(recording, _REAL_FRAMES)
+            own = CameraPin(frames[:1])
+            for against, pin in (("first_episode", first), ("own_start", own)):
+                results = collate(pin.check(frame.image) for frame in frames)
+                known = results.verdict != PinVerdict.CANNOT_KNOW
+                low = float(results.shift_low_px.nanmedian())
+                turned = known & (results.T_ref_from_live.t.norm(dim=-1) == 0)
+                row: Row = {"scene": data, "pair": [0, len(recording) - 1], "method": against, "truth": None}
+                row |= {
+                    "note": f"episode {recording.episode}",
+                    "known": int(known.sum()),
+                    "moved": int(results.moved.sum()),
+                }
+                row |= {"low_px": None if math.isnan(low) else low, "turned": int(turned.sum())}
+                rows.append(row)
+    return rows
+
+
+def _spread_frames(recording: Recording, n: int) -> list[Frame]:
+    return [recording[k * len(recording) // n] for k in range(n)]
+
+
+def summarise_pin(rows: Sequence[Row], times: Sequence[Mapping[str, float]]) -> Row:
+    """Rows -> summary: key -> value, with its interval over scenes where it is a fraction of pictures."""
+    planted = [row for row in rows if row["method"] == "pin"]
+    scenes = sorted({row["scene"] for row in planted})
+    summary: Row = {}
+
+    def add_share(key: str, chosen: Sequence[Row], verdict: str) -> None:
+        parts = [[row["verdict"] == verdict for row in chosen if row["scene"] == scene] for scene in scenes]
+        shares = [sum(part) / len(part) for part in parts if part]
+        if shares:
+            summary[f"pin.{key}"] = bootstrap.interval_over_scenes(shares, statistic="mean").entry("1")
+
+    add_share("false_alarms", [row for row in planted if row["kind"] == "still"], "moved")
+    add_share("unknown", planted, "cannot_know")
+    for kind, unit in (("shift", "px"), ("turn", "deg")):
+        for size in sorted({row["size"] for row in planted if row["kind"] == kind}):
+            chosen = [row for row in planted if (row["kind"], row["size"]) == (kind, size)]
+            add_share(f"found_{size:g}{unit}", chosen, "moved")
+    moved = [row for row in planted if row["kind"] != "still" and "sigmas" in row]
+    for suffix, chosen in (("half", [row for row in moved if row["hidden"] == 0.5]), ("all", moved)):
+        if chosen:
+            sigmas = torch.tensor([row["sigmas"] for row in chosen]).abs()
+            values = {f"{key}_{suffix}": median(row[key] for row in chosen) for key in ("error_mm", "error_deg")}
+            values |= {f"within_{k}sigma_{suffix}": float((sigmas < k).double().mean()) for k in (1, 2)}
+            summary |= {f"pin.{key}": bootstrap.without_interval(x, len(chosen)) for key, x in values.items()}
+    for key in times[0] if times else ():
+        summary[f"pin.{key}"] = bootstrap.without_interval(median(each[key] for each in times), len(times))
+    for data, limit in _REAL_SETS:
+        episodes = [row for row in rows if row["scene"] == data]
+        if episodes:
+            counts = {f"{data}_moved": sum((row["low_px"] or 0.0) > limit for row in episodes)}
+            known = sum(row["known"] for row in episodes)
+            counts |= {f"{data}_turned": sum(row["turned"] for row in episodes) / max(known, 1)}
+            summary |= {f"pin.{key}": bootstrap.without_interval(float(x), len(episodes)) for key, x in counts.items()}
+    return summary
+
+
+def pin_verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
+    """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
+    values = {key: summary[key]["value"] for key in PIN_BARS if key in summary}
+    missed = [
+        f"{key} {values[key]:.3g} (bar {low:g} to {high:g})"
+        for key, (low, high) in PIN_BARS.items()
+        if key in values and not low <= values[key] <= high
+    ]
+    undefined = [key for key in PIN_BARS if key not in values]
+    notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
+    why = "; ".join([f"{len(values) - len(missed)} of {len(values)} bars met", *missed, *notes])
+    return (None if undefined and not missed else not missed), why

@@ -1,0 +1,91 @@
+"""``dhtorch pin``: pictures, captures, live cameras and sets without depth; limits, exit codes, files."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from support.rooms import moved_camera_capture
+
+from dhtorch.cli import pin, run
+from dhtorch.data.io import decode
+from dhtorch.export import encode_png
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A capture whose camera stands still and is moved between frames 3 and 4; and its frames."""
+    return moved_camera_capture(tmp_path_factory.mktemp("pin") / "capture")
+
+
+def pinned(out, *words):
+    code = run.main(["pin", *map(str, words), f"output={out}", "ref_frames=1"])
+    return code, json.loads((out / "pin.json").read_text())
+
+
+def test_an_episode_has_its_change_point_and_exceeds_its_limit(tmp_path, capture, capsys):
+    root, _ = capture
+    code, found = pinned(tmp_path / "out", root, root, "max_frames=null", "fail_on=moved>2px")
+    assert code == run.EXIT_SOME_FAILED and found["metric"]
+    (episode,) = found["episodes"]
+    assert episode["verdict"] == "moved" and [change["frame"] for change in episode["changes"]] == [4]
+    assert [row["verdict"] for row in episode["pictures"][:4]] == ["not_moved"] * 4
+    shown = capsys.readouterr().out
+    assert "exceeded: moved is" in shown and "from frame 4 by" in shown
+    page = (tmp_path / "out" / "pin.html").read_text()
+    assert page.count("data:image/png") == 2 and "<svg" in page and "moved" in page
+
+
+def test_a_picture_within_the_limit_passes_and_the_guide_says_the_way(tmp_path, capture, capsys):
+    root, frames = capture
+    for name, k in (("still", 1), ("moved", 5)):
+        (tmp_path / f"{name}.png").write_bytes(encode_png(frames[k].image[0].permute(1, 2, 0).numpy()))
+    code, found = pinned(tmp_path / "a", root, tmp_path / "still.png", "fail_on=moved>2px,unknown>0.5")
+    assert code == run.EXIT_DONE and found["exceeded"] == []
+    code, found = pinned(tmp_path / "b", root, tmp_path / "moved.png", "guide=true", "fail_on=moved>2px")
+    assert code == run.EXIT_SOME_FAILED and "mm" in capsys.readouterr().out
+    code, found = pinned(tmp_path / "c", tmp_path / "still.png", tmp_path / "moved.png", "data.fov=60")
+    assert code == run.EXIT_DONE and not found["metric"]
+    assert "direction" in found["episodes"][0]["pictures"][0]
+
+
+def test_a_live_camera_is_watched_until_its_end(tmp_path, capture, capsys, monkeypatch):
+    root, frames = capture
+    pictures = [np.ascontiguousarray(frame.image[0].permute(1, 2, 0).numpy()[..., ::-1]) for frame in frames[3:6]]
+
+    class Capture:
+        released = 0
+
+        def __init__(self, index):
+            assert index == 7
+            self.left = list(pictures)
+
+        def isOpened(self):
+            return True
+
+        def read(self):
+            return (True, self.left.pop(0)) if self.left else (False, None)
+
+        def release(self):
+            Capture.released += 1
+
+    monkeypatch.setattr(decode.cv2, "VideoCapture", Capture)
+    code, found = pinned(tmp_path / "out", root, "7", "guide=true")
+    assert code == run.EXIT_DONE and Capture.released == 1
+    assert [row["verdict"] for row in found["episodes"][0]["pictures"]] == ["not_moved", "moved", "moved"]
+    shown = capsys.readouterr().out
+    assert "0: in place" in shown and "mm" in shown
+
+
+def test_a_camera_that_does_not_open_and_bad_limits_are_one_line(tmp_path, capture, capsys):
+    root, _ = capture
+    assert run.main(["pin", str(root), "99", f"output={tmp_path}"]) == run.EXIT_FAILED
+    assert run.main(["pin", str(root), str(root), "fail_on=moved<2", f"output={tmp_path}"]) == run.EXIT_FAILED
+    assert run.main(["pin", str(root), str(root), "max_frames=0", f"output={tmp_path}"]) == run.EXIT_FAILED
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("dhtorch: ")]
+    assert "camera" in lines[0] and "fail_on" in lines[1] and "max_frames" in lines[2]
+
+
+def test_pictures_are_spread_evenly():
+    assert pin._spread(10, 5) == [0, 2, 4, 6, 8] and pin._spread(3, 8) == [0, 1, 2] and pin._spread(9, 1) == [0]
+    assert torch.equal(torch.tensor(pin._spread(4, None)), torch.arange(4))

@@ -1,0 +1,253 @@
+"""A reference view against pictures: offsets that are known exactly, verdicts, sigma, and the words for a mount."""
+
+import math
+import random
+from functools import cache
+
+import pytest
+import torch
+
+import dhtorch
+from dhtorch.codes import PinReason, PinVerdict
+from dhtorch.geometry import se3
+from dhtorch.geometry.camera import to_matrix
+from dhtorch.geometry.se3 import Pose
+from dhtorch.measure import pin_solve
+from dhtorch.measure.pin import CameraPin, PinResult, chi2_quantile
+from dhtorch.measure.pin_report import describe_pin, find_change_points, guide_pin
+from dhtorch.pytree import collate
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
+from dhtorch.synthetic.paths import hand_held_path
+
+#: Offsets of the camera (rotation rad, translation m): none, a small one, a large one, none.
+OFFSETS = torch.tensor(
+    [[0.0] * 6, [0.004, -0.006, 0.003, 0.004, -0.003, 0.006], [0.02, -0.03, 0.01, 0.02, 0.01, 0.03], [0.0] * 6],
+    dtype=torch.float64,
+)
+
+
+@cache
+def room(light="day"):
+    here = hand_held_path("static", 1, step_m=0.0, rate_hz=30.0, seed=3)
+    poses = collate(se3.compose(here, se3.exp(xi[None])) for xi in OFFSETS)
+    return LitRoom(light=light, seed=3, n_frames=len(OFFSETS), hw=(120, 160), supersample=2, true_poses=poses)
+
+
+@cache
+def pinned():
+    return CameraPin(room()[0])
+
+
+@cache
+def found():
+    return collate(pinned().check(room()[k].image) for k in range(4))
+
+
+def test_offsets_are_right_to_three_sigma():
+    result = found()
+    assert bool(result.metric.all()) and result.reason.tolist() == [PinReason.ANSWERED] * 4
+    error = se3.log(se3.compose(result.T_ref_from_live, se3.invert(se3.exp(OFFSETS))))
+    sigma = result.cov.diagonal(dim1=1, dim2=2).sqrt()
+    assert bool((error.abs() < 3.5 * sigma).all())
+    assert float(error[:, :3].norm(dim=1).max()) < math.radians(0.1) and float(error[:, 3:].norm(dim=1).max()) < 0.004
+    assert torch.equal(result.moved, torch.tensor([False, True, True, False]))
+
+
+def test_shift_is_the_median_motion_of_the_scene():
+    depth = room().truth(0)["depth"].double()
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    uv = torch.stack((u, v), -1).reshape(1, -1, 2).double()
+    camera = room()[0].camera.map(lambda x: x.double())
+    xyz = dhtorch.geometry.camera.unproject(camera, uv, depth.reshape(1, -1))
+    moved = dhtorch.geometry.camera.project(camera, se3.apply(se3.invert(se3.exp(OFFSETS[1:2])), xyz))
+    expected = float((moved - uv).norm(dim=-1).median())
+    assert float(found().shift_px[1]) == pytest.approx(expected, rel=0.15)
+
+
+def test_a_batch_gives_the_results_of_its_pictures():
+    together = pinned().check(torch.cat([room()[k].image for k in (1, 3)]))
+    for k, alone in enumerate(found()[i : i + 1] for i in (1, 3)):
+        assert torch.equal(together.offset[k], alone.offset[0]) and torch.equal(together.cov[k], alone.cov[0])
+    assert torch.equal(pinned().check(room()[1].image[0]).offset, found().offset[1:2])
+
+
+@pytest.mark.parametrize(
+    "light", [pytest.param(name, marks=[pytest.mark.slow] * (name != "day")) for name in ROOM_LIGHTS]
+)
+def test_other_light_exposure_and_arms_are_no_motion(light):
+    frame, hidden = hide_behind_arms(room(light)[3], 0.4, arm_seed=1, draw=random.Random(5))
+    assert 0.4 <= float(hidden.float().mean()) < 0.7
+    result = pinned().check(photograph_again(frame, random.Random(6)).image)
+    assert not bool(result.moved) and (int(result.verdict) == PinVerdict.CANNOT_KNOW or float(result.shift_px) < 0.4)
+
+
+def test_half_hidden_offset_is_found():
+    frame, _ = hide_behind_arms(room()[2], 0.3, arm_seed=1, draw=random.Random(4))
+    result = pinned().check(frame.image)
+    assert bool(result.moved)
+    assert float((result.T_ref_from_live.t - se3.exp(OFFSETS[2:3]).t).norm()) < 0.006
+
+
+def test_what_shows_nothing_of_the_reference_is_not_known():
+    noise = torch.randint(0, 256, (1, 3, 120, 160), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    for image in (noise, torch.zeros(1, 3, 120, 160)):
+        result = pinned().check(image)
+        assert int(result.verdict) == PinVerdict.CANNOT_KNOW and int(result.reason) != PinReason.ANSWERED
+        assert bool(result.offset.isnan().all()) and not bool(result.inlier.any())
+    assert describe_pin(result).startswith("cannot know: ") and guide_pin(result) == [describe_pin(result)]
+
+
+def test_without_depth_the_rotation_is_known_and_the_translation_up_to_scale():
+    frame = room()[0]
+    pin = CameraPin(frame.replace(depth=torch.zeros_like(frame.depth)))
+    still, moved = pin.check(room()[3].image), pin.check(room()[2].image)
+    assert not bool(still.moved) and not pin.metric and not bool(still.metric)
+    assert float(still.T_ref_from_live.t.norm()) == 0 and bool(still.cov[0, 3:].isnan().all())
+    assert bool(moved.moved)
+    length = float(moved.T_ref_from_live.t.norm())
+    assert length == pytest.approx(1.0) or length == 0
+    assert "no length" in describe_pin(still)
+
+
+def test_epipolar_motion_finds_direction_and_rotation():
+    draw = torch.Generator().manual_seed(0)
+    T = se3.exp(torch.tensor([[0.02, -0.01, 0.03, 0.08, -0.05, 0.06]], dtype=torch.float64))
+    ray = torch.cat((torch.rand(1, 2, 200, generator=draw) - 0.5, torch.ones(1, 1, 200)), 1).double()
+    Y = se3.apply(T, (ray * (1 + 2 * torch.rand(1, 1, 200, generator=draw).double())).mT).mT
+    f, c = torch.full((1, 2), 500.0, dtype=torch.float64), torch.full((1, 2), 320.0, dtype=torch.float64)
+    uv = Y[:, :2] / Y[:, 2:] * f[..., None] + c[..., None]
+    seen = pin_solve.Sightings(ray, uv, torch.ones(1, 200, dtype=torch.bool), f, c)
+    start = Pose(se3.exp(torch.tensor([[0.0, 0.06, 0.03, 0, 0, 0]], dtype=torch.float64)).R, torch.zeros(1, 3).double())
+    motion, noise, agreeing = pin_solve.epipolar_motion(seen, start, torch.ones(1, dtype=torch.float64))
+    direction = T.t / T.t.norm()
+    assert float((motion.t * direction).sum()) > 0.999 and float(noise) < 0.01
+    assert float(agreeing.double().mean()) > 0.95
+    assert float(se3.rotation_angle(motion.R @ T.R.mT)) < 1e-3
+
+
+def test_a_capture_as_reference_leaves_out_what_moves():
+    frames = [hide_behind_arms(room()[0], 0.15, arm_seed=0, draw=random.Random(k))[0] for k in range(5)]
+    clean = room()[0].image.float()
+    pin = CameraPin(frames)
+    assert not pin.notes
+    far = (pin.frame.image.float() - clean).abs().amax(1) > 20
+    first = (frames[0].image.float() - clean).abs().amax(1) > 20
+    assert float(far.float().mean()) < 0.7 * float(first.float().mean())  # the arms' feet are in all frames
+    moving = CameraPin([room()[0], room()[2], room()[1]])
+    assert moving.notes and torch.equal(moving.frame.image, room()[0].image)
+
+
+def test_given_intrinsics_replace_the_references():
+    K = to_matrix(room()[0].camera)
+    assert torch.allclose(pinned().check(room()[1].image, K[0]).offset, found().offset[1:2])
+    zoomed = K.clone()
+    zoomed[:, :2, :2] *= 1.05
+    assert not torch.allclose(pinned().check(room()[1].image, zoomed).offset, found().offset[1:2], atol=1e-3)
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="false_alarm_rate"):
+        CameraPin(room()[0], false_alarm_rate=1.5)
+    with pytest.raises(ValueError, match="texture"):
+        CameraPin(room()[0].replace(image=torch.zeros(1, 3, 120, 160)))
+    with pytest.raises(ValueError, match="image"):
+        pinned().check(torch.zeros(120, 160))
+
+
+@pytest.mark.parametrize(("p", "degrees", "expected"), [(0.99, 6, 16.8119), (0.95, 3, 7.8147), (0.999, 6, 22.4577)])
+def test_quantiles_are_those_of_the_tables(p, degrees, expected):
+    assert chi2_quantile(p, degrees) == pytest.approx(expected, abs=1e-3)
+
+
+# --------------------------------------------------------------------------------------------------- series and words
+
+
+def series(offsets, sigma_px=0.05):
+    """Results of pictures with given offsets (n, 6), as a scene at 1 m before a focal length of 500 px has them."""
+    n = len(offsets)
+    form = torch.diag(torch.tensor([500.0] * 6, dtype=torch.float64) ** 2)
+    cov = (sigma_px / 500) ** 2 * torch.eye(6, dtype=torch.float64)
+    T = se3.exp(offsets.double())
+    one = torch.ones(n, dtype=torch.float64)
+    return PinResult(
+        T_ref_from_live=T,
+        cov=cov.expand(n, 6, 6),
+        shift_px=500 * offsets.norm(dim=1),
+        shift_sigma_px=sigma_px * one,
+        distance=one,
+        verdict=torch.zeros(n, dtype=torch.int32),
+        reason=torch.zeros(n, dtype=torch.int32),
+        metric=one > 0,
+        flow_form=form.expand(n, 6, 6),
+        inlier=torch.ones(n, 1) > 0,
+        agreement=one,
+        coverage=one,
+        false_alarm_rate=0.01 * one,
+    )
+
+
+def noisy(n, seed=0, sigma_px=0.05):
+    return sigma_px / 500 * torch.randn(n, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_change_points_are_found_where_they_are_planted():
+    offsets = noisy(30)
+    offsets[12:, 1] += 4 / 500
+    offsets[20:, 3] -= 8 / 500
+    changes = find_change_points(series(offsets))
+    assert [change.first for change in changes] == [12, 20]
+    assert changes[0].shift_px == pytest.approx(4, rel=0.1) and changes[1].shift_px == pytest.approx(8, rel=0.1)
+    result = series(offsets)
+    verdict = result.verdict.clone()
+    verdict[5:8] = PinVerdict.CANNOT_KNOW
+    assert [change.first for change in find_change_points(result.replace(verdict=verdict))] == [12, 20]
+
+
+def test_series_without_a_change_have_none():
+    alarms = sum(bool(find_change_points(series(noisy(24, seed)), min_px=0.0)) for seed in range(100))
+    assert alarms <= 6
+    assert find_change_points(series(noisy(3))) == []
+
+
+def test_the_guide_says_which_way_back():
+    text = guide_pin(series(torch.tensor([[0.0, 0.0, 0.0, 0.010, 0.0, -0.005]])))
+    assert text[:2] == ["← left 10.0 mm", "⊗ forward 5.0 mm"]
+    turned = guide_pin(series(torch.tensor([[0.0, math.radians(1.0), 0.0, 0.0, 0.0, 0.0]])))
+    assert turned[0] == "↶ turn left 1.00°"
+    tilted = guide_pin(series(torch.tensor([[math.radians(2.0), 0.0, math.radians(-3.0), 0.0, 0.0, 0.0]])))
+    assert "⤓ tilt down 2.00°" in tilted and "⟳ roll right 3.00°" in tilted
+    assert guide_pin(series(torch.zeros(1, 6)))[0] == "in place"
+
+
+def test_the_guide_brings_a_camera_back():
+    """Following the words: the live camera displaced by what they say stands where the reference stood."""
+    result = found()[2:3]
+    back = se3.invert(result.T_ref_from_live)
+    lines = guide_pin(result)
+    names = {
+        "→ right": (0, 1),
+        "← left": (0, -1),
+        "↓ down": (1, 1),
+        "↑ up": (1, -1),
+        "⊗ forward": (2, 1),
+        "⊙ back": (2, -1),
+    }
+    step = torch.zeros(3, dtype=torch.float64)
+    for line in lines:
+        for words, (axis, sign) in names.items():
+            if line.startswith(words):
+                step[axis] = sign * float(line.removeprefix(words).split()[0]) / 1e3
+    assert float((step - back.t[0]).abs().max()) < 0.0021
+    there = se3.compose(se3.exp(OFFSETS[2:3]), Pose(back.R, step[None]))
+    assert float(there.t.norm()) < 0.008
+
+
+def test_the_line_of_a_picture_states_its_sigmas():
+    line = describe_pin(series(torch.tensor([[0.0, 0.0, 0.0, 0.010, 0.0, 0.0]])))
+    assert line.startswith("not moved, 5.00 ± 0.05 px") and "displaced by 10.0 ± 0.2 mm" in line
+
+
+def test_the_public_name_is_the_class():
+    assert dhtorch.CameraPin is CameraPin and dhtorch.PinResult is PinResult
+    assert isinstance(SyntheticRoom, type)
