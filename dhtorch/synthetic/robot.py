@@ -208,13 +208,6 @@ class _RoomWithThings(SyntheticRoom):
         return self._world
 
 
-def hand_camera_pose(task: int, scene: int, seed: int, time: float) -> Pose:
-    """``T_world_from_cam`` (1), float64, of the in-hand camera of a scene, s after its start, in the room ``seed +
-    scene``."""
-    c2w = torch.from_numpy(_Episode.of(task, scene, seed).camera(time))[None]
-    return Pose(c2w[:, :3, :3], c2w[:, :3, 3])
-
-
 @dataclass(frozen=True)
 class _Step:
     """One look and the advance after it: pose of the hand's camera as a function of time (s), and what it looks at."""

@@ -36,8 +36,7 @@ from dhtorch.pipeline.presets import MAP
 from dhtorch.pytree import collate
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
-from dhtorch.synthetic.paths import hand_held_path
-from dhtorch.synthetic.robot import hand_camera_pose
+from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles
 
 #: Planted shifts of the median point of the scene, px, in scenes of even and of odd seeds.
 SHIFTS_PX = ((0.5, 2.0, 20.0), (1.0, 2.0, 5.0, 60.0))
@@ -47,6 +46,15 @@ TURNS_DEG = ((0.1, 1.0, 5.0), (0.5, 2.0))
 
 #: Frames of the walk through a room, at one of which the camera is fixed.
 _WALK_FRAMES = 60
+
+#: Views of near things by a robot's in-hand camera, by the seed of their room: x, y, z, m, in the room's axes; yaw,
+#: pitch and roll, degrees.
+_HAND_VIEWS = {
+    40: (-0.6451562338272959, -0.6330819928967936, 0.9900038014875783, 0.5743682646317088, -1.886077491937736, 0.0),
+    41: (0.28339298116278344, -0.7240929029209617, 2.6755582776203513, 10.959030472411982, -34.40247730169597, 0.0),
+    50: (0.17631704239040302, -1.0425272866973005, 1.487560624160218, -6.738759430204524, -11.497159360827037, 0.0),
+    51: (-1.0944453425761174, -1.0976297617754658, 1.4519560340299307, -3.303042414038269, -9.995246291159521, -0.0),
+}
 
 #: Shares of the picture that arms hide in the reference and in a live picture.
 _REFERENCE_SHARE, _LIVE_SHARES = 0.15, (0.0, 0.5, 0.6)
@@ -110,11 +118,15 @@ def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int 
     """Reference and pictures of a camera in the room of a seed: a view of the ``room``, or of things at a ``robot``."""
     draw = Random(f"pin {kind} {seed}")
     if kind == "robot":
-        here = hand_camera_pose(seed % 12, 0, seed, 0.2)
+        if seed not in _HAND_VIEWS:
+            raise ValueError(f"experiment.robots: found {seed}, expected of {', '.join(map(str, _HAND_VIEWS))}")
+        x, y, z, *angles = _HAND_VIEWS[seed]
+        R = torch.tensor([rotation_from_angles(*angles)], dtype=torch.float64)
+        here = Pose(R, torch.tensor([[x, y, z]], dtype=torch.float64))
     else:
         here = hand_held_path("walk", _WALK_FRAMES, step_m=0.02, rate_hz=30.0, seed=seed)[draw.randrange(_WALK_FRAMES)]
         here = here.map(lambda x: x[None])
-    options = {"seed": seed, "hw": hw, "supersample": supersample}
+    options: dict[str, Any] = {"seed": seed, "hw": hw, "supersample": supersample}
     still = LitRoom(n_frames=1, true_poses=here, **options)
     depth = still.truth(0)["depth"]
     wanted = [("shift", size) for size in SHIFTS_PX[seed % 2]] + [("turn", size) for size in TURNS_DEG[seed % 2]]
