@@ -240,7 +240,8 @@ class CameraPin:
 
     def _check_one(self, picture: Tensor, camera: Camera) -> PinResult:
         """The result (1) of one picture (1, 1, H, W)."""
-        hint, places = TrackHint(pyramid=self.pyramid), int(self.known.sum())
+        hint = TrackHint(pyramid=self.pyramid)
+        places = int(self.known.sum())
         tracks = _TRACKER(self.picture, picture, self.places.uv, hint=hint)
         seen = self._see(tracks, camera)
         fit = self._search(tracks, seen, camera)

@@ -89,7 +89,8 @@ def describe_pin(result: PinResult) -> str:
         return f"{verdict}: {PinReason.entries[int(result.reason)].definition}"
     sigma = result.cov[0].diagonal().clamp_min(0).sqrt()
     turn, shift = result.offset[0].split(3)
-    angle, angle_sigma = math.degrees(float(turn.norm())), math.degrees(float(sigma[:3].norm()))
+    angle = math.degrees(float(turn.norm()))
+    angle_sigma = math.degrees(float(sigma[:3].norm()))
     px = f"{verdict}, {float(result.shift_px):.2f} ± {float(result.shift_sigma_px):.2f} px"
     text = f"{px}, turned by {angle:.3f} ± {angle_sigma:.3f}°"
     if bool(result.metric):

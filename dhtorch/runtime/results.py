@@ -74,6 +74,8 @@ _SUMMARY_FIELDS: dict[str, Any] = {
 }
 _METRIC_FIELDS: dict[str, Any] = {"name": str, "larger_is_better": (bool, None), "with_interval": bool}
 _ROW_FIELDS: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
+#: Fields of a row that only some experiments write.
+_OPTIONAL_ROW_FIELDS: dict[str, Any] = dict.fromkeys(("truth", "role", "note"), _OPTIONAL_TEXT)
 
 
 def build_result(
@@ -147,7 +149,8 @@ def validate_result(result: Any, where: str = "result") -> None:
     for k, metric in enumerate(result.get("metrics", ())):
         _check_fields(metric, _METRIC_FIELDS, f"{where}.metrics.{k}")
     for k, row in enumerate(result["rows"]):
-        _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", more=True)
+        optional = {name: kind for name, kind in _OPTIONAL_ROW_FIELDS.items() if isinstance(row, dict) and name in row}
+        _check_fields(row, _ROW_FIELDS | optional, f"{where}.rows.{k}", more=True)
         pair = row["pair"]
         is_pair = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
         _expect(is_pair, f"{where}.rows.{k}.pair", pair, "[i, j] or null")

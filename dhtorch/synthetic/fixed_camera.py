@@ -82,7 +82,8 @@ def hide_behind_arms(frame: Frame, share: float, *, arm_seed: int, draw: Random)
     Arms of one ``arm_seed`` have the same texture and begin at the same places; ``draw`` bends them.
     """
     H, W = frame.hw
-    image, hidden = frame.image.float(), torch.zeros(H, W, dtype=torch.bool)
+    image = frame.image.float()
+    hidden = torch.zeros(H, W, dtype=torch.bool)
     base = Random(f"arms {arm_seed}")
     for k in range(_MAX_ARMS):
         if float(hidden.float().mean()) >= share:
