@@ -484,7 +484,7 @@ def main() -> None:
         "runs": runs,
     }
     if args.json:
-        storage.write_json(args.json, result)
+        storage.write_json(args.json, [result])
 
 
 if __name__ == "__main__":

@@ -286,7 +286,7 @@ CLOSED_LOOP = {
 
 def closed_loop() -> str:
     """Success rates of the policies in simulation."""
-    result = json.loads((RESULTS / "closed_loop.json").read_text())
+    (result,) = json.loads((RESULTS / "closed_loop.json").read_text())
     rows = []
     for name, words in CLOSED_LOOP.items():
         rate = result["rates"][name]
@@ -300,7 +300,7 @@ def closed_loop() -> str:
 
 def closed_loop_differences() -> str:
     """Paired differences of the success rates, in points, over the test episodes."""
-    result = json.loads((RESULTS / "closed_loop.json").read_text())
+    (result,) = json.loads((RESULTS / "closed_loop.json").read_text())
     rows = [
         [f"`{name}`", *(f"{100 * e[key]:+.0f}" for key in ("value", "low", "high"))]
         for name, e in result["differences"].items()

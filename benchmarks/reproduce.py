@@ -176,6 +176,7 @@ ASIDE = {
 
 #: Options that a file may lack, and the value that leaves the part of the method out.
 LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": None, "complete": None}
+LEFT_OUT |= {"weight": "variance"}
 LEFT_OUT |= dict.fromkeys(("trajectory_lag_s", "trajectory_drift_deg_per_s", "trajectory_rotation_noise_deg"), 0.0)
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.

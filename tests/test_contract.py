@@ -529,6 +529,12 @@ ELSEWHERE = {
     ),  # tests/pipeline/test_accelerator.py
     "dhtorch.geometry.determinism.chunk_size",
     "dhtorch.metrics.holdout.truth_kept_ratio",
+    "dhtorch.metrics.risk.find_knee",
+    *(f"dhtorch.geometry.sensor_noise.{name}" for name in ("get_sensor_noise", "sensor_of_format")),
+    *(
+        f"dhtorch.metrics.uncertainty.{name}"  # tests/metrics/test_uncertainty.py
+        for name in ("disjoint_agreement", "interval_coverage", "measure_uncertainty", "range_bias")
+    ),
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
     *(f"dhtorch.geometry.patches.{name}" for name in ("fits_window_kernel", "window_arguments")),
