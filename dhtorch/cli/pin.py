@@ -45,6 +45,9 @@ _PIN_LIMITS = {
 #: Horizontal field of view assumed where nothing is stated, degrees: shifts in px do not depend on it.
 _ASSUMED_FOV_DEG = 60.0
 
+#: What is printed where it is assumed.
+_ASSUMPTION = f"no intrinsics; assumed a field of view of {_ASSUMED_FOV_DEG:g}° (data.fov): degrees and mm depend on it"
+
 #: Endings of the files that are single pictures.
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -69,17 +72,22 @@ class Episode:
 
     @property
     def verdict(self) -> int:
-        """The verdict on most pictures that are known, MOVED where there are changes; a code of PinVerdict."""
+        """MOVED where there are changes, CANNOT_KNOW where fewer than half of the pictures are known, else what
+        most known ones are; a code of PinVerdict."""
         counts = [int((self.result.verdict == code).sum()) for code in range(3)]
-        if self.changes or counts[PinVerdict.MOVED] > counts[PinVerdict.NOT_MOVED]:
+        if self.changes:
             return PinVerdict.MOVED
-        return PinVerdict.NOT_MOVED if counts[PinVerdict.NOT_MOVED] else PinVerdict.CANNOT_KNOW
+        if 2 * counts[PinVerdict.CANNOT_KNOW] > sum(counts):
+            return PinVerdict.CANNOT_KNOW
+        return PinVerdict.MOVED if counts[PinVerdict.MOVED] > counts[PinVerdict.NOT_MOVED] else PinVerdict.NOT_MOVED
 
     @property
     def middle(self) -> PinResult:
         """The result (1) of the picture with the median shift among those of the episode's verdict."""
-        shift = torch.where(self.result.verdict == self.verdict, self.result.shift_px, torch.nan)
-        k = int((shift - shift.nanmedian()).abs().nan_to_num(math.inf).argmin())
+        among = (self.result.verdict == self.verdict).nonzero()[:, 0]
+        among = among if len(among) else torch.arange(len(self.result.verdict))  # changes, each part of them unknown
+        shift = self.result.shift_px[among]
+        k = int(among[(shift - shift.nanmedian()).abs().nan_to_num(math.inf).argmin()])
         return self.result[k : k + 1]
 
 
@@ -113,7 +121,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         content |= {"exceeded": exceeded, "whole": summary, "episodes": rows}
         storage.write_json(folder / "pin.json", storage.to_strict_json(content))
         _write_pages(folder, pin, episodes, summary, exceeded, settings)
-    print("\n".join([*(f"exceeded: {line}" for line in exceeded), "wrote", f"  {folder / 'pin.html'}"]))
+    print("\n".join([*(f"exceeded: {line}" for line in exceeded), f"Wrote pin.json, pin.html in {folder}."]))
     return int(bool(exceeded))
 
 
@@ -142,12 +150,15 @@ def _open(path: Path, settings: Mapping[str, Any]) -> Sequence[Recording]:
         _ = recordings[0]  # many are opened on access
         return recordings
     except MissingIntrinsicsError:
+        print(f"{path}: {_ASSUMPTION}")
         return open_all(path, settings["format"], **{**options, "fov": _ASSUMED_FOV_DEG})
 
 
 def _stated_camera(path: Path, image: Tensor, stated: Mapping[str, Any]) -> Camera:
     """Intrinsics of a single picture: those of the options, else of an assumed field of view."""
     options = {key: stated[key] for key in ("intrinsics", "K", "fov") if stated[key] is not None}
+    if not options:
+        print(f"{path}: {_ASSUMPTION}")
     K = parse_intrinsics(path, (image.shape[-2], image.shape[-1]), **(options or {"fov": _ASSUMED_FOV_DEG})).K
     if K is None:
         raise ValueError(f"data.intrinsics: found {stated['intrinsics']!r}, expected fx,fy,cx,cy or degrees")

@@ -1,6 +1,7 @@
 """``dhtorch pin``: pictures, captures, live cameras and sets without depth; limits, exit codes, files."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from support.rooms import moved_camera_capture
 
 from dhtorch.cli import pin, run
+from dhtorch.codes import PinVerdict
 from dhtorch.data.io import decode
 from dhtorch.export import encode_png
 
@@ -89,3 +91,16 @@ def test_a_camera_that_does_not_open_and_bad_limits_are_one_line(tmp_path, captu
 def test_pictures_are_spread_evenly():
     assert pin._spread(10, 5) == [0, 2, 4, 6, 8] and pin._spread(3, 8) == [0, 1, 2] and pin._spread(9, 1) == [0]
     assert torch.equal(torch.tensor(pin._spread(4, None)), torch.arange(4))
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "expected"),
+    [
+        ([PinVerdict.NOT_MOVED, *[PinVerdict.CANNOT_KNOW] * 5], PinVerdict.CANNOT_KNOW),
+        ([PinVerdict.NOT_MOVED] * 3 + [PinVerdict.CANNOT_KNOW] * 3, PinVerdict.NOT_MOVED),
+        ([PinVerdict.MOVED] * 3 + [PinVerdict.NOT_MOVED] + [PinVerdict.CANNOT_KNOW] * 2, PinVerdict.MOVED),
+    ],
+)
+def test_the_verdict_of_an_episode_needs_half_of_its_pictures(verdicts, expected):
+    result = SimpleNamespace(verdict=torch.tensor(verdicts))
+    assert pin.Episode("e", list(range(len(verdicts))), result, torch.zeros(3, 4, 4)).verdict == expected

@@ -84,6 +84,8 @@ def _draw_drift(drift: Sequence[tuple[str, Sequence[int], Sequence[float]]]) -> 
         xs += [*(float(first + k) for k in range(len(shifts))), None]
         ys += [*(None if math.isnan(y) else y for y in shifts), None]
     names = "pictures in order, a line an episode"
-    panel = Panel("Shift of the scene", fit_axis(xs, names), fit_axis(ys, "shift, px", low=0.0), size=_DRIFT_SIZE_PT)
+    panel = Panel(
+        "Shift of the scene", fit_axis(xs, names), fit_axis([*ys, 1.0], "shift, px", low=0.0), size=_DRIFT_SIZE_PT
+    )
     panel.line(xs, ys, Stroke("#4269d0"))
     return make_tag("figure", Markup(render_inline_svg(panel)))
