@@ -305,10 +305,10 @@ def _write_pages(
     shown = []
     for rank, k in enumerate(order):
         episode = episodes[k]
-        middle, largest = episode.middle, episode.result.shift_px.nan_to_num(0.0).max()
+        middle, largest = episode.middle, episode.result.shift_px.nan_to_num(-math.inf).max()
         numbers = torch.stack([middle.shift_px[0], middle.shift_sigma_px[0], largest]).tolist()
         verdict = name(PinVerdict, episode.verdict).lower().replace("_", " ")
-        cells = [verdict, *(f"{x:.2f}" for x in numbers), str(len(episode.changes))]
+        cells = [verdict, *(f"{x:.2f}" if math.isfinite(x) else "–" for x in numbers), str(len(episode.changes))]
         after = encode_png(_to_rgb(episode.worst)) if rank < settings["pictures"] else None
         shown.append(PinnedEpisode(episode.name, cells, before if after else None, after))
     drift = [(episode.name, episode.numbers, episode.result.shift_px.tolist()) for episode in episodes]

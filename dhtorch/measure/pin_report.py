@@ -39,6 +39,8 @@ class ChangePoint(NamedTuple):
 def find_change_points(result: PinResult, *, false_alarm_rate: float = 0.01, min_px: float = 1.0) -> list[ChangePoint]:
     """Lasting changes within a sequence of pictures, by halving it where the means on both sides differ most.
 
+    A single picture that differs from both its neighbours is none.
+
     Args:
         result: of the pictures of an episode in their order; those that cannot be known are left out.
         false_alarm_rate: of one or more change points in a sequence of independent errors without any.
@@ -51,7 +53,8 @@ def find_change_points(result: PinResult, *, false_alarm_rate: float = 0.01, min
     offset, cov = result.offset[known][:, :free], result.cov[known][:, :free, :free].mean(0)
     whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(cov), offset.mT, upper=False)  # (free, n)
     scatter = whitened.diff(dim=1).abs().median(1, keepdim=True).values / MEDIAN_DIFFERENCE
-    whitened = whitened / scatter.clamp_min(1.0)  # at least the stated noise
+    whitened = _without_single_outliers(whitened / scatter.clamp_min(1.0))  # at least the stated noise
+    offset = _without_single_outliers(offset.mT).mT
     limit = chi2_quantile(1 - false_alarm_rate / max(len(known) - 1, 1), free)
     square_px = result.flow_form[known[0], :free, :free]
     changes: list[ChangePoint] = []
@@ -67,6 +70,12 @@ def find_change_points(result: PinResult, *, false_alarm_rate: float = 0.01, min
             changes.append(ChangePoint(int(known[low + k]), shift, F.pad(change, (0, 6 - free))))
         parts += [(low, low + k), (low + k, high)]
     return sorted(changes)
+
+
+def _without_single_outliers(x: Tensor) -> Tensor:
+    """Series (free, n) -> medians of three neighbours: a lasting change stays where it is, a wrong picture disappears."""
+    middle = x.unfold(1, 3, 1).median(-1).values
+    return torch.cat([middle[:, :1], middle, middle[:, -1:]], 1)
 
 
 def _best_split(x: Tensor) -> tuple[int | None, float]:

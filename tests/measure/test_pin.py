@@ -210,6 +210,13 @@ def test_series_without_a_change_have_none():
     assert find_change_points(series(noisy(3))) == []
 
 
+@pytest.mark.parametrize("wrong", [0, 1, 7, 23])
+def test_one_wrong_picture_is_no_change(wrong):
+    offsets = noisy(24)
+    offsets[wrong, :3] += 8 / 500
+    assert find_change_points(series(offsets)) == []
+
+
 def test_the_guide_says_which_way_back():
     text = guide_pin(series(torch.tensor([[0.0, 0.0, 0.0, 0.010, 0.0, -0.005]])))
     assert text[:2] == ["← left 10.0 mm", "⊗ forward 5.0 mm"]
