@@ -73,7 +73,7 @@ def find_change_points(result: PinResult, *, false_alarm_rate: float = 0.01, min
 
 
 def _without_single_outliers(x: Tensor) -> Tensor:
-    """Series (free, n) -> medians of three neighbours: a lasting change stays where it is, a wrong picture disappears."""
+    """Series (free, n) -> medians of three neighbours: lasting changes stay, a wrong picture disappears."""
     middle = x.unfold(1, 3, 1).median(-1).values
     return torch.cat([middle[:, :1], middle, middle[:, -1:]], 1)
 
