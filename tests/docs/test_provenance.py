@@ -89,5 +89,7 @@ def test_no_constant_was_chosen_on_the_untouched_scenes():
         for comment in re.findall(r"Source:[^\n]*(?:\n\s*#:?[^\n]*)*", path.read_text(encoding="utf-8"))
         if scenes.search(comment.split("Source:")[1]) and "vision.middlebury.edu" not in comment
     ]
-    calibrations = [p.name for p in sorted(ROOT.rglob("*.json")) if scenes.search(p.read_text(encoding="utf-8"))]
+    files = [p for p in sorted(ROOT.rglob("*.json")) if p.parent.name != "cli"]  # there: what `dhtorch fetch` loads
+    calibrations = [p.name for p in files if scenes.search(p.read_text(encoding="utf-8"))]
+    assert files
     assert cited == [] and calibrations == []
