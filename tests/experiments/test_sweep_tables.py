@@ -64,7 +64,7 @@ def probe_result(cells: int, seed: int) -> dict[str, Any]:
     """Result of ``vo_probe`` on one scene, with random errors."""
     generator = torch.Generator().manual_seed(seed)
     errors = ProbeErrors([f"room {k}" for k in range(5)])
-    arms = [arm for arm, blocks in PROBE_ARMS.items() if not {"xfeat", "efficientnet"} & set(blocks)]
+    arms = [arm for arm, blocks in PROBE_ARMS.items() if not {"xfeat", "efficientnet", "true_depth"} & set(blocks)]
     for cohort in ("moving", "all"):
         errors.counts[cohort] = torch.full((5,), 20.0, dtype=torch.float64)
         errors.squares |= {(arm, cohort): 10 + 10 * torch.rand(5, generator=generator).double() for arm in arms}

@@ -187,7 +187,7 @@ def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
 def test_double_precision_goes_in_beside_pictures_of_bytes():
     room = SyntheticRoom(n_frames=8, hw=(60, 80), depth_hw=(60, 80), lidar="exact")
     reference, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
-    for as_given in (lambda x: (255 * x).byte(), lambda x: x.float()):
+    for as_given in (lambda x: x.byte(), lambda x: x.float() / 255):
         asked, view = (frame.replace(image=as_given(frame.image)) for frame in (reference, other))
         assert complete_depth(asked, view, **FAST).depth.dtype == torch.float64
 

@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -178,7 +179,8 @@ def test_options_that_cannot_be_raise_when_it_is_made(wrong, said):
 def test_true_is_what_complete_does_by_itself():
     standard = DenseMaps.from_options(True)
     assert standard.options == DenseMaps.from_options({}).options and DenseMaps.from_options(False) is None
-    assert {k: completion.complete_depth.__kwdefaults__[k] for k in standard.options} == standard.options
+    parameters = signature(completion.complete_depth).parameters
+    assert {k: parameters[k].default for k in standard.options} == standard.options
     changed = DenseMaps.from_options({"size": 224, "max_sigma_rel": 1}).options
     assert changed == {**standard.options, "size": 224, "max_sigma_rel": 1}
 

@@ -49,6 +49,7 @@ MAP_1 = Method(
         min_conf=1,
         sigma_m=0.0,
         sigma_rel=0.01,
+        sensor=None,
         search_px=None,
         edge_rel=0.1,
         dark=0.05,
