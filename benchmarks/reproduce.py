@@ -184,7 +184,7 @@ OUTDATED: set[str] = {"part_ablation", "streams", "stress"}
 #: Those whose ``auto`` is that of the second release.
 OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
 #: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
-OUTDATED |= {"kornia_twin", "latency", "part_ablation_auto", "paths_motion", "room_device_pose", "room_gate_ablation"}
+OUTDATED |= {"kornia_twin", "latency", "part_ablation_auto"}
 
 #: Files with the settings of today that were made before their range-split candidates had to be masked returns of the
 #: sensor: on independent truth (built-in rooms) real holes are among their candidates, on sparse maps (driving scenes)
