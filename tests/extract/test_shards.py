@@ -15,7 +15,7 @@ pytest.importorskip("pyarrow")
 import pyarrow
 from pyarrow import parquet
 
-from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
+from dhtorch.codes import Cause, Flag, Gate, Hole, PoseCode, Source, names
 from dhtorch.data import FormatError
 from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.extract.dataset import ExtractedRow
@@ -118,6 +118,7 @@ def test_codes_fit_a_byte_and_are_named():
         "problem": SampleProblem,
         "source_map": Source,
         "gate_map": Gate,
+        "cause_map": Cause,
     }
     assert tables == {k: names(t) for k, t in wanted.items()}
     assert sum(tables["flag"]) == 255 and max(max(t) for t in tables.values()) == 128

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dhtorch.runtime import storage
 from dhtorch.viz.plots.axis import fit_axis
-from dhtorch.viz.plots.colours import Stroke
+from dhtorch.viz.plots.colours import SERIES_COLOURS, Stroke
 from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
 from dhtorch.viz.plots.panel import Panel
@@ -87,5 +87,5 @@ def _draw_drift(drift: Sequence[tuple[str, Sequence[int], Sequence[float]]]) -> 
     panel = Panel(
         "Shift of the scene", fit_axis(xs, names), fit_axis([*ys, 1.0], "shift, px", low=0.0), size=_DRIFT_SIZE_PT
     )
-    panel.line(xs, ys, Stroke("#4269d0"))
+    panel.line(xs, ys, Stroke(SERIES_COLOURS[0]))
     return make_tag("figure", Markup(render_inline_svg(panel)))
