@@ -113,8 +113,8 @@ def main() -> int:
     options = parser.parse_args()
     data = Path(os.environ["DHTORCH_DATA"])
     if options.first is not None:
-        measured = measure_first(data / options.first)
-        print(measured)
+        measured = [measure_first(data / options.first)]
+        print(*measured)
         options.json.write_text(storage.dump_strict_json(storage.to_strict_json(measured), indent=1) + "\n")
         return 0
     rows = []

@@ -116,6 +116,7 @@ SCRIPTS |= {
     "xfeat_noise": "",
     "sweep": "",
     "captures": "--pictures docs/assets/captures",
+    "first_picture": "--first holo_a",
     "memory": "",
     "phone": "",
     "enrich": "",
@@ -147,6 +148,7 @@ SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names i
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {
+    "first_picture": "captures",
     "kornia": "beside_kornia",
     "loader_workers0": "loader",
     "dense_speed": "dense",
@@ -184,7 +186,7 @@ OUTDATED: set[str] = {"part_ablation", "streams", "stress"}
 #: Those whose ``auto`` is that of the second release.
 OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
 #: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
-OUTDATED |= {"kornia_twin", "latency", "part_ablation_auto"}
+OUTDATED |= {"kornia_twin", "part_ablation_auto"}
 
 #: Files with the settings of today that were made before their range-split candidates had to be masked returns of the
 #: sensor: on independent truth (built-in rooms) real holes are among their candidates, on sparse maps (driving scenes)
