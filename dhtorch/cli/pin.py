@@ -45,9 +45,6 @@ _PIN_LIMITS = {
 #: Horizontal field of view assumed where nothing is stated, degrees: shifts in px do not depend on it.
 _ASSUMED_FOV_DEG = 60.0
 
-#: What is printed where it is assumed.
-_ASSUMPTION = f"no intrinsics; assumed a field of view of {_ASSUMED_FOV_DEG:g}° (data.fov): degrees and mm depend on it"
-
 #: Endings of the files that are single pictures.
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -98,9 +95,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data.
     """
     limits = parse_limits(re.sub(r"(\d)\s*px", r"\1", settings["fail_on"] or ""), _PIN_LIMITS)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        files.set_opencv_threads(settings["threads"])
     folder = Path(str(settings["output"])).expanduser()
     with open_output_folder(folder, "output") as output:
         output.check(folder / file for file in ("pin.json", "pin.html"))
@@ -143,22 +137,20 @@ def _read_reference(settings: Mapping[str, Any]) -> tuple[Frame, str | None]:
 
 
 def _open(path: Path, settings: Mapping[str, Any]) -> Sequence[Recording]:
-    """The recordings of a capture; one that states no intrinsics is opened with an assumed field of view."""
+    """The recordings of a capture; one that states no intrinsics is opened with an assumed field of view, with the
+    warning that such a camera has."""
     options = {key: value for key, value in settings["data"].items() if value is not None}
     try:
         recordings = open_all(path, settings["format"], **options)
         _ = recordings[0]  # many are opened on access
         return recordings
     except MissingIntrinsicsError:
-        print(f"{path}: {_ASSUMPTION}")
         return open_all(path, settings["format"], **{**options, "fov": _ASSUMED_FOV_DEG})
 
 
 def _stated_camera(path: Path, image: Tensor, stated: Mapping[str, Any]) -> Camera:
     """Intrinsics of a single picture: those of the options, else of an assumed field of view."""
     options = {key: stated[key] for key in ("intrinsics", "K", "fov") if stated[key] is not None}
-    if not options:
-        print(f"{path}: {_ASSUMPTION}")
     K = parse_intrinsics(path, (image.shape[-2], image.shape[-1]), **(options or {"fov": _ASSUMED_FOV_DEG})).K
     if K is None:
         raise ValueError(f"data.intrinsics: found {stated['intrinsics']!r}, expected fx,fy,cx,cy or degrees")
@@ -206,13 +198,16 @@ def _compare(
 
 
 def _compare_pictures(
-    pin: CameraPin, title: str, images: Iterable[Tensor], device: str
+    pin: CameraPin, title: str, images: Iterable[Tensor], device: str, report: Callable[[PinResult], None] | None = None
 ) -> tuple[PinResult, Tensor, list[ChangePoint]]:
-    """Results of an episode's pictures, the picture with the largest shift, and lasting changes."""
+    """Results of an episode's pictures, each also handed to ``report``, the picture with the largest shift, and lasting
+    changes."""
     results: list[PinResult] = []
     worst, largest = None, -1.0
     for image in images:
         results.append(pin.check(image.to(device)))
+        if report is not None:
+            report(results[-1])
         shift = float(results[-1].shift_px.nan_to_num(0.0))
         if shift > largest:
             worst, largest = image, shift
@@ -225,17 +220,15 @@ def _compare_pictures(
 def _compare_live(pin: CameraPin, index: int, settings: Mapping[str, Any]) -> Episode:
     """Pictures of a live camera, each with its line, until ``max_frames`` or the end of the camera."""
 
-    def watched() -> Iterator[Tensor]:
-        for k, picture in enumerate(files.read_live_camera(index)):
-            image = torch.from_numpy(picture)
-            result = pin.check(image.to(settings["device"]))
-            lines = guide_pin(result) if settings["guide"] else [describe_pin(result)]
-            print(f"{k}: {'   '.join(lines)}", flush=True)
-            yield image
-            if k + 1 == settings["max_frames"]:
-                return
+    numbers = itertools.count()
 
-    result, worst, changes = _compare_pictures(pin, f"camera {index}", watched(), settings["device"])
+    def report(result: PinResult) -> None:
+        lines = guide_pin(result) if settings["guide"] else [describe_pin(result)]
+        print(f"{next(numbers)}: {'   '.join(lines)}", flush=True)
+
+    pictures = itertools.islice(files.read_live_camera(index), settings["max_frames"])
+    images = (torch.from_numpy(picture) for picture in pictures)
+    result, worst, changes = _compare_pictures(pin, f"camera {index}", images, settings["device"], report)
     return Episode(f"camera {index}", list(range(len(result.verdict))), result, worst, changes)
 
 

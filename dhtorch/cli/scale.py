@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from dhtorch.data.io import decode as files
 from dhtorch.data.scene import scenes_of
 from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.measure.local_scales import REGIONS, ScaleTolerance
@@ -38,9 +36,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
         ValueError, OSError: bad options or data, or views that match no frame.
     """
     _check_options(settings)
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     if len(scenes) > 1:
         raise ValueError(f"data: found {len(scenes)} recordings for one model, expected one (data.root=…)")
