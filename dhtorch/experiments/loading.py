@@ -66,14 +66,20 @@ class PairDataset(Dataset[LoadedPair]):
 
 def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[LoadedPair]:
     """Data loader of the pairs, in batches of ``batch``, read by ``workers`` processes."""
-    workers = workers if len(data) else 0
+    return _make_loader(data, _collate, batch=batch, workers=workers if len(data) else 0)
+
+
+def _make_loader(
+    data: Dataset[Any], collate: Callable[[Any], Any], *, batch: int | None, workers: int
+) -> DataLoader[Any]:
+    """Data loader with started workers: a fork would copy locks held by threads of torch and OpenCV in this process,
+    and may deadlock."""
     return DataLoader(
         data,
         batch_size=batch,
         num_workers=workers,
-        collate_fn=_collate,
+        collate_fn=collate,
         worker_init_fn=_init_worker,
-        # A fork would copy locks held by threads of torch and OpenCV in this process, and may deadlock.
         multiprocessing_context="spawn" if workers else None,
     )
 
@@ -121,17 +127,7 @@ class ChunkReader:
         ends = itertools.accumulate(map(len, groups.values()))
         self._spans = {k: (end - len(groups[k]), end) for k, end in zip(groups, ends, strict=True)}
         data = ChunkDataset([chunk for chunks in groups.values() for chunk in chunks], dtype)
-        workers = min(workers, len(data))
-        self._loader = iter(
-            DataLoader(
-                data,
-                batch_size=None,
-                num_workers=workers,
-                collate_fn=_unchanged,
-                worker_init_fn=_init_worker,
-                multiprocessing_context="spawn" if workers else None,
-            )
-        )
+        self._loader = iter(_make_loader(data, _unchanged, batch=None, workers=min(workers, len(data))))
         self._n_read = 0
 
     def length(self, group: int) -> int:
