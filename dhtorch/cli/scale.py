@@ -26,6 +26,9 @@ from dhtorch.viz.plots.colours import FAINT, SERIES_COLOURS, Stroke
 from dhtorch.viz.viewer import validation as pages
 
 _COLUMNS = ("frame of the capture", "matched by", "scale", "difference", "sigma")
+#: Differences that a plot of scales shows at least: smaller ones are rounding. Source: derived, a tenth of 1 %.
+_LEAST_REACH = 1e-3
+
 _NOTE = "Bars are two standard deviations of the frame, the region or the range alone, without the sensor's own scale."
 
 
@@ -57,7 +60,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
             write_model(model, out, similarity)
         content = {"model": str(root), "format": model.format, "capture": recording.name, **describe_scale(result)}
         storage.write_json(out / "scale.json", storage.to_strict_json(content))
-        _write_page(out / "scale.html", root.name, result)
+        _write_page(out / "scale.html", _model_name(root), result)
     for line in _format_lines(root, result):
         print(line)
     print(f"wrote {out}: {'the model in metres, ' if result.ok else ''}scale.json, scale.html")
@@ -115,6 +118,11 @@ def _regions(result: ScaleResult) -> list[tuple[int, int, float, float]]:
     return rows
 
 
+def _model_name(root: Path) -> str:
+    """Name of a model in sentences: its folder or file, with the folder above it where that is a number (COLMAP's)."""
+    return f"{root.parent.name}/{root.name}" if root.name.isdigit() and root.parent.name else root.name
+
+
 def _format_lines(root: Path, result: ScaleResult) -> list[str]:
     """Printed sentences."""
     half = 2 * result.sigma
@@ -122,10 +130,10 @@ def _format_lines(root: Path, result: ScaleResult) -> list[str]:
     lines = [*(f"note: {note}" for note in result.notes)]
     n = len(result.matches)
     if result.faults:
-        lines += [f"{root.name}: refused. No single scale fits it ({n} views compared):"]
+        lines += [f"{_model_name(root)}: refused. No single scale fits it ({n} views compared):"]
         lines += [f"  {fault}" for fault in _distinct(result.faults)]
         return [*lines, "  a sensor that is itself off at places looks the same: --tolerance accepts changes up to it"]
-    lines += [f"{root.name}: 1 unit = {result.scale:.6g} m ± {half:.1%} (k = 2; {n} views; sigma: {terms})"]
+    lines += [f"{_model_name(root)}: 1 unit = {result.scale:.6g} m ± {half:.1%} (k = 2; {n} views; sigma: {terms})"]
     if result.trajectory_scale is not None:
         scale, sigma = result.trajectory_scale
         lines += [f"  by the cameras' paths alone: {scale:.6g} m (scatter {sigma:.1%})"]
@@ -179,7 +187,8 @@ def _plots(result: ScaleResult) -> list[tuple[str, bytes]]:
 
 def _plot(label: str, rows: list[tuple[float, float, float]]) -> bytes:
     rows = [row for row in rows if np.isfinite(row[1])]
-    reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma, 0.0)]
+    reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma)]
+    reach += [-_LEAST_REACH, _LEAST_REACH]
     x = fit_axis([row[0] for row in rows], label)
     y = fit_axis(reach, "difference, %", percent=True)
     panel = Panel("", x, y, size=(420, 216))

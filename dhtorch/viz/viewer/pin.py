@@ -17,6 +17,7 @@ from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
 from dhtorch.viz.plots.panel import Panel
 from dhtorch.viz.plots.svg import render_inline_svg
+from dhtorch.viz.viewer.validation import build_scrolled_table
 
 #: Columns of the table, after the episode's name.
 _PIN_COLUMNS = ("verdict", "median shift, px", "its sigma, px", "largest shift, px", "changes")
@@ -53,15 +54,9 @@ def write_pin_page(
     """
     top = [make_tag("h1", title), *(make_tag("p", text) for text in sentences)]
     top += [make_tag("p", text, class_="bad") for text in failed]
-    heads = (make_tag("th", head, scope="col") for head in ("episode", *_PIN_COLUMNS))
-    rows = (
-        make_tag("tr", make_tag("th", e.name, scope="row"), *(make_tag("td", cell, class_="num") for cell in e.cells))
-        for e in episodes
-    )
-    table = make_tag("table", make_tag("thead", make_tag("tr", *heads)), make_tag("tbody", *rows))
-    about = {"class_": "scroll", "tabindex": "0", "role": "region", "aria_label": "All episodes"}
+    table = build_scrolled_table("All episodes", ("episode", *_PIN_COLUMNS), [(e.name, e.cells) for e in episodes])
     figures = [_build_blink(e) for e in episodes if e.before is not None and e.after is not None]
-    body = make_tag("main", _draw_drift(drift), make_tag("div", table, **about), *figures)
+    body = make_tag("main", _draw_drift(drift), table, *figures)
     page = build_document(f"{title} · dhtorch pin", make_tag("header", *top), body, own=_PIN_CSS)
     return storage.replace_file(path, page.encode("utf-8"))
 

@@ -5,7 +5,7 @@ The page is self-contained. Names from files are untrusted and escaped.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,29 +37,32 @@ def _build_page(
     word: str = "validate",
     note: str = _STATES_NOTE,
 ) -> str:
-    """The page: summary lines, a table of all frames in the given order, and the figures."""
+    """The page: summary lines, a table of the frames with cells in the given order, and the figures."""
     top = [
         make_tag("h1", title),
         *(make_tag("p", text) for text in sentences),
         *(make_tag("p", text, class_="bad") for text in failed),
     ]
-    heads = (
-        make_tag("th", name, scope="col", class_="num" if k else None) for k, name in enumerate(("frame", *columns))
+    table = build_scrolled_table(
+        "All frames", ("frame", *columns), [(frame.name, frame.cells) for frame in frames if frame.cells]
     )
-    rows = (
-        make_tag(
-            "tr", make_tag("th", frame.name, scope="row"), *(make_tag("td", cell, class_="num") for cell in frame.cells)
-        )
-        for frame in frames
-    )
-    table = make_tag("table", make_tag("thead", make_tag("tr", *heads)), make_tag("tbody", *rows))
-    about = {"class_": "scroll", "tabindex": "0", "role": "region", "aria_label": "All frames"}
     figures = (_build_figure(frame.name, frame.picture) for frame in frames if frame.picture is not None)
     parts = (
         make_tag("header", *top, make_tag("p", note, class_="note")),
-        make_tag("main", make_tag("div", table, **about), *figures),
+        make_tag("main", table, *figures),
     )
     return build_document(f"{title} · dhtorch {word}", *parts)
+
+
+def build_scrolled_table(label: str, heads: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> Markup:
+    """Table with a name and cells in each row, which scrolls on narrow screens; ``label`` names the region."""
+    top = (make_tag("th", head, scope="col", class_="num" if k else None) for k, head in enumerate(heads))
+    body = (
+        make_tag("tr", make_tag("th", name, scope="row"), *(make_tag("td", cell, class_="num") for cell in cells))
+        for name, cells in rows
+    )
+    table = make_tag("table", make_tag("thead", make_tag("tr", *top)), make_tag("tbody", *body))
+    return make_tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=label)
 
 
 def _build_figure(name: str, picture: bytes) -> Markup:
