@@ -12,11 +12,11 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 #: Reason of a failure (pattern) → what it is, and what helps.
 FIXES: dict[str, tuple[str, str]] = {
-    r"BackwardCompatibilityError": ("reads v3.0 alone", "`enrich format=lerobot`"),
-    r"OfflineModeIsEnabled": ("reads v2.1 alone, and then looks for the set at the hub", "`enrich format=v2.1`"),
-    r"found no picture in the tables": ("pictures are video, which it does not decode", "LeRobot's own loader"),
+    r"BackwardCompatibilityError": ("supports only v3.0", "`enrich format=lerobot`"),
+    r"OfflineModeIsEnabled": ("supports only v2.1, and then queries the hub", "`enrich format=v2.1`"),
+    r"found no picture in the tables": ("images are stored as video, which it does not decode", "LeRobot's own loader"),
     r"found no poses": ("a source without poses", "a source with poses, or a LeRobot format"),
-    r"knows no depth": ("knows no depth", "LeRobot 0.6 or later"),
+    r"knows no depth": ("no depth support", "LeRobot 0.6 or later"),
     r"lerobot-rollout is in": ("has no `lerobot-rollout`", "LeRobot 0.6 or later"),
     r"\Anot installed\Z|\Anot run\Z": ("not run", "an environment with it, see the command below"),
 }
@@ -47,11 +47,11 @@ class Outcome(NamedTuple):
 
 
 def clients() -> str:
-    """Client × version × command: sets on which it passed, and of the others why not and what helps."""
+    """Client × version × command: sets on which it passed, and for the others the reason and the fix."""
     groups: dict[tuple[str, str, str], list[Outcome]] = {}
     for outcome in (*_loaders(), *_trained(), *_plugin(), *_readers()):
         groups.setdefault(outcome[:3], []).append(outcome)
-    head = ["client", "version", "command, or what it reads", "passed", "depth off by, mm", "why not", "fix"]
+    head = ["client", "version", "command, or what it reads", "passed", "largest depth difference, mm", "reason", "fix"]
     lines = [head, [":--"] * len(head)]
     for (client, version, command), outcomes in groups.items():
         run = [outcome for outcome in outcomes if outcome.passed is not None]

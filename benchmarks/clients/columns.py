@@ -1,4 +1,4 @@
-"""Names of an enriched set's columns, from what its ``meta/info.json`` says."""
+"""Names of an enriched set's columns, read from its ``meta/info.json``."""
 
 import json
 import sys
@@ -7,9 +7,9 @@ from typing import Any
 
 
 def columns(root: str, *, tables: bool = False) -> dict[str, Any]:
-    """Options for ``ExtendDepth``, and beside them ``target``: what a policy predicts, and ``fps``.
+    """Path of a set -> ``keys``, options for ``ExtendDepth``; ``target``, the column that a policy predicts; ``fps``.
 
-    ``tables``: the loader has only what stands in the tables, so a picture that is video ends the script.
+    ``tables``: the loader reads only the tables, so the script stops where images are stored as video.
     """
     info = json.loads((Path(root) / "meta" / "info.json").read_text())
     features = info["features"]
@@ -19,6 +19,6 @@ def columns(root: str, *, tables: bool = False) -> dict[str, Any]:
     camera = f"observation.{image.removeprefix('observation.images.')}"
     keys = {"image": image, "depth": depth, "intrinsics": f"{camera}.intrinsics", "depth_unit": "m"}
     if tables and features[image]["dtype"] == "video":
-        sys.exit(f"{image} is video: found no picture in the tables, expected a loader that decodes, as LeRobot's")
+        sys.exit(f"{image} is video: found no picture in the tables, expected a loader that decodes video, such as LeRobot's")
     target = "action" if "action" in features else f"{camera}.T_world_from_cam"  # a hand-held camera's own motion
     return {"keys": keys, "target": target, "fps": info["fps"]}

@@ -1,6 +1,6 @@
 """nerfstudio's own parser of an enriched folder: pictures, cameras, poses, depth and points, against the files.
 
-In an environment that has nerfstudio, of which only what its parsers import is needed (and open3d for the points):
+In an environment with nerfstudio (only the imports of its parsers are needed, and open3d for the points):
 python benchmarks/clients/nerfstudio_parser.py NERFSTUDIO
 """
 

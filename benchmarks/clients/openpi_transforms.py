@@ -1,7 +1,7 @@
-"""In openpi's manner: dict → dict transforms of NumPy leaves one after the other, then every leaf stacked.
+"""openpi's interface: a chain of dict -> dict transforms with NumPy leaves, then every leaf stacked to a batch.
 
-openpi itself is no package of an index; pictures become its size by what its client installs, ``openpi_client``. A
-geometry image, where the set has one, takes a second place of a camera; its codes are not blended by the resizing.
+openpi itself is not on a package index; images are resized by its client, ``openpi_client``. A geometry image, where
+the set has one, is passed as a second camera; the resizing does not blend its codes.
 
 In an environment that has openpi-client and dhtorch:  python benchmarks/clients/openpi_transforms.py DST
 """
@@ -28,7 +28,7 @@ KEYS = {f"{key}": f"observation/{key}" for key in ("image", "other_image", "dept
 
 
 def policy_inputs(data: dict[str, Any]) -> dict[str, Any]:
-    """What the model takes: pictures by their name there, and the depth tokens beside them."""
+    """Sample -> the model's inputs: images by the names that it expects, and depth tokens."""
     picture = image_tools.resize_with_pad(image_tools.convert_to_uint8(data["observation/image"]), SIDE, SIDE)
     images = {"image": {"base_0_rgb": picture}, "image_mask": {"base_0_rgb": np.True_}}
     if "observation/geometry" in data:

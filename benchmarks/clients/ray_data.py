@@ -1,4 +1,4 @@
-"""Ray Data: depth tokens of an enriched set's rows, made by actors that each hold the transform once.
+"""Ray Data: depth tokens of an enriched set's rows, computed by actors that each hold one transform.
 
 In an environment that has ray[data] and dhtorch:  python benchmarks/clients/ray_data.py DST
 """
@@ -21,7 +21,7 @@ from dhtorch.transforms import ExtendedDataset
 
 
 class Extend:
-    """An actor: opens the set when it starts, and adds depth tokens to the rows whose numbers it gets."""
+    """An actor: opens the set when it starts, and computes the depth tokens of rows by their numbers."""
 
     def __init__(self, root: str) -> None:
         spec = columns(root, tables=True)
