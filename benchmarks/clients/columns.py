@@ -19,6 +19,6 @@ def columns(root: str, *, tables: bool = False) -> dict[str, Any]:
     camera = f"observation.{image.removeprefix('observation.images.')}"
     keys = {"image": image, "depth": depth, "intrinsics": f"{camera}.intrinsics", "depth_unit": "m"}
     if tables and features[image]["dtype"] == "video":
-        sys.exit(f"{image} is video: found no picture in the tables, expected a loader that decodes video, such as LeRobot's")
+        sys.exit(f"{image} is video: found no picture in the tables, expected a loader that decodes video (LeRobot)")
     target = "action" if "action" in features else f"{camera}.T_world_from_cam"  # a hand-held camera's own motion
     return {"keys": keys, "target": target, "fps": info["fps"]}

@@ -38,7 +38,7 @@ def test_sets_are_counted_by_client_version_and_command(tmp_path, monkeypatch):
     write(tmp_path, monkeypatch, clients=rows)
     assert cells(client_tables.clients()) == [
         ["LeRobot", "0.4.4", "`enrich format=lerobot`", "2 of 2", "2", "", ""],
-        ["LeRobot", "0.4.4", "`enrich format=v2.1`", "0 of 1", "–", "reads v3.0 alone", "`enrich format=lerobot`"],
+        ["LeRobot", "0.4.4", "`enrich format=v2.1`", "0 of 1", "–", "supports only v3.0", "`enrich format=lerobot`"],
         [
             "PyTorch",
             "2.10.0",
