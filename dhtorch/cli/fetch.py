@@ -168,7 +168,15 @@ def _cut(content: bytes, cut: Mapping[str, list[float]]) -> bytes:
         first, last = cut["rows"]
         return b"".join(lines[int(first) : int(last) + 1])
     low, high = cut["times"]
-    return b"".join(line for line in lines if line.startswith(b"#") or low <= float(line.split()[0]) <= high)
+    return b"".join(line for line in lines if line.startswith(b"#") or low <= _first_number(line) <= high)
+
+
+def _first_number(line: bytes) -> float:
+    """First number of a line; NaN where there is none, which no span of times contains."""
+    try:
+        return float(line.split()[0])
+    except (IndexError, ValueError):
+        return float("nan")
 
 
 def download(address: str, folder: Path, digest: str | None, max_bytes: int = MAX_BYTES) -> Path:

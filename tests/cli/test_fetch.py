@@ -56,7 +56,7 @@ def server():
 
 
 PICTURE, POSES = bytes(range(256)) * 400, b"0\n1\n2\n3\n4\n"
-TRACK = b"# t x\n1.0 a\n2.0 b\n3.0 c\n"
+TRACK = b"# t x\n\nno time\n1.0 a\n2.0 b\n3.0 c\n"
 FILES = {"rgb/0 1.png": sha(PICTURE), "poses.txt": sha(b"2\n3\n")}
 
 
