@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from dhtorch.data.models import Similarity, read_model, write_model
 from dhtorch.data.scene import scenes_of
 from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.measure.local_scales import REGIONS, ScaleTolerance
-from dhtorch.measure.models import Similarity, read_model, write_model
 from dhtorch.measure.scale import ScaleOptions, ScaleResult, metric_scale
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import open_output_folder

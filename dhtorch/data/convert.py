@@ -188,6 +188,15 @@ def to_quaternions(
     return axis_angle_to_quaternion(torch.from_numpy(rotation)).numpy()[:, [1, 2, 3, 0]]
 
 
+def quaternions_of(
+    R: Tensor,  # (n, 3, 3)
+) -> Tensor:
+    """Rotations → unit quaternions (n, 4), x y z w, by the largest component, by kornia."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415  (0.2 s)
+
+    return rotation_matrix_to_quaternion(R.contiguous())[:, [1, 2, 3, 0]]
+
+
 def slerp(
     a: np.ndarray,  # (n, 4) unit quaternions
     b: np.ndarray,  # (n, 4)

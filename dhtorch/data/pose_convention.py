@@ -15,6 +15,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from dhtorch.data.convert import quaternions_of
 from dhtorch.data.units import UNIT_METRES
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
@@ -52,7 +53,7 @@ class PoseConvention:
         """Poses (B) as read → T_world_from_cam (B) that was meant."""
         R, t = poses.R, poses.t * (UNIT_METRES[self.unit] if isinstance(self.unit, str) else self.unit)
         if self.quaternion is not None:
-            R = _rotation(_quaternion(R)[:, list(_QUATERNION_ORDERS[self.quaternion])])
+            R = _rotation(quaternions_of(R)[:, list(_QUATERNION_ORDERS[self.quaternion])])
         meant = Pose(R, t)
         if self.inverse:
             meant = se3.invert(meant)
@@ -139,13 +140,6 @@ def _parse_metres(word: str) -> float:
         return metres
     known = ("world_to_camera", *_AXES_ALIASES, "right_up_back …", *_QUATERNION_ORDERS, *UNIT_METRES, "metres")
     raise ValueError(f"pose_convention: found {word!r}, expected {', '.join(known)}")
-
-
-def _quaternion(R: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) → unit quaternions (B, 4), x y z w, by the largest component."""
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415  (0.2 s)
-
-    return rotation_matrix_to_quaternion(R.contiguous())[:, [1, 2, 3, 0]]
 
 
 def _rotation(q: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from torch import Tensor
 from dhtorch.codes import Flag
 from dhtorch.data.io.decode import read_image
 from dhtorch.data.io.safe_open import record_opened_files
+from dhtorch.data.models import ModelView, SceneModel, Similarity, read_model
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
@@ -40,7 +41,6 @@ from dhtorch.measure.local_scales import (
     find_faults,
     local_scales,
 )
-from dhtorch.measure.models import ModelView, SceneModel, Similarity, read_model
 from dhtorch.records import Camera, Frame, Pose, Samples, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.pose import pnp_ransac

@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import torch
 
+from dhtorch.data.models import ModelView, SceneModel
 from dhtorch.experiments.compare.scale_study import ScaleScene, make_scale_model, regular_grid_of
 from dhtorch.export.arrays import rotation_to_wxyz
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
-from dhtorch.measure.models import ModelView, SceneModel
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Near limit of the models and captures, m.

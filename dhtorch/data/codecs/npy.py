@@ -94,6 +94,23 @@ def _smallest_float_dtype(dtype: np.dtype) -> type[np.floating]:
     return np.float32 if exact else np.float64
 
 
+def list_npz(file: Path) -> set[str]:
+    """Names of the arrays of an ``.npz`` archive, after checking the memory that all of them take.
+
+    Raises:
+        FormatError: missing or damaged archive, or larger than the memory limit allows.
+    """
+    data = read_bytes(file)
+    check_zip_directory(io.BytesIO(data), file)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            check_memory(file, "arrays", size, f"{size} bytes unpacked", len(data))
+            return {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
+    except (zipfile.BadZipFile, ValueError) as error:
+        raise FormatError(file, "archive", error, "a whole .npz archive") from None
+
+
 def read_npz(file: Path, key: str) -> np.ndarray:
     """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
 

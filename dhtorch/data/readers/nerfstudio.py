@@ -59,7 +59,7 @@ _MAX_ROTATION_ERROR = 1e-4
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
-    file = _find_transforms(root)
+    file = find_transforms(root)
     return None if file is None else file.name
 
 
@@ -79,7 +79,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
             folder, or values that are no camera or pose.
     """
     root = Path(root)
-    file = _find_transforms(root) or root / _FILE_NAME
+    file = find_transforms(root) or root / _FILE_NAME
     meta = files.read_json(file)
     folder = file.parent
     undo, report = _parse_applied(meta, file)
@@ -88,7 +88,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     for k, entry in enumerate(files.get_entry(meta, "frames", list, file)):
         if not isinstance(entry, dict):
             raise FormatError(file, f"frames.{k}", type(entry).__name__, "an object")
-        image = _resolve_image(folder, entry, file, k)
+        image = resolve_image(folder, entry, file, k)
         if not image.is_file():
             missing.append(image)
             continue
@@ -123,7 +123,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     ]
 
 
-def _find_transforms(root: Path) -> Path | None:
+def find_transforms(root: Path) -> Path | None:
     """The file with the transforms: in the folder, or the path itself; None where there is none."""
     if root.is_file():
         return root if root.suffix == ".json" and root.name.startswith("transforms") else None
@@ -131,7 +131,7 @@ def _find_transforms(root: Path) -> Path | None:
     return file if file.is_file() else None
 
 
-def _resolve_image(folder: Path, entry: Mapping[str, Any], file: Path, k: int) -> Path:
+def resolve_image(folder: Path, entry: Mapping[str, Any], file: Path, k: int) -> Path:
     """Path of an image; a name without suffix gets that of the file that exists."""
     image = _resolve(folder, files.get_entry(entry, "file_path", str, file), file, f"frames.{k}.file_path")
     if image.is_file() or image.suffix in _IMAGE_SUFFIXES:
@@ -147,26 +147,38 @@ def _resolve(folder: Path, name: str, file: Path, field: str) -> Path:
 def _parse_row(
     meta: Mapping[str, Any], entry: Mapping[str, Any], image: Path, undo: np.ndarray, file: Path, k: int
 ) -> PosedImage:
-    values = {**meta, **entry}
-    _check_model(values, file, k)
-    lens = [_number(values, name, file, k, 0.0) for name in _LENS_NAMES]
-    if k4 := _number(values, "k4", file, k, 0.0):
-        raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
-    hw = _parse_size(values, image, file, k)
+    K, hw, distortion = parse_lens({**meta, **entry}, image, file, k)
     depth_name = next((entry[key] for key in _DEPTH_KEYS if isinstance(entry.get(key), str)), None)
     depth = None if depth_name is None else _resolve(file.parent, depth_name, file, f"frames.{k}.depth_file_path")
     time, origin = entry.get("timestamp"), entry.get(_ORIGIN_KEY)
     return PosedImage(
         image=image,
         depth=depth if depth is not None and depth.is_file() else None,
-        K=_parse_K(values, hw, file, k),
+        K=K,
         source=file,
         c2w=_parse_pose(entry, undo, file, k),
-        distortion=tuple(lens) if any(lens) else None,
+        distortion=distortion,
         hw=hw,
         origin=_resolve(file.parent, origin, file, f"frames.{k}.{_ORIGIN_KEY}") if isinstance(origin, str) else None,
         time=float(time) if isinstance(time, int | float) and not isinstance(time, bool) else None,
     )
+
+
+def parse_lens(
+    values: Mapping[str, Any], image: Path, file: Path, k: int
+) -> tuple[np.ndarray, tuple[int, int], tuple[float, ...] | None]:
+    """Entries of the file and of frame ``k`` → K with pixel centres at integers, (height, width) that it refers to, and
+    distortion.
+
+    Raises:
+        FormatError: a camera model without OpenCV's distortion, or values that are no camera.
+    """
+    _check_model(values, file, k)
+    lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
+    if k4 := _number(values, "k4", file, k, 0.0):
+        raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
+    hw = _parse_size(values, image, file, k)
+    return _parse_K(values, hw, file, k), hw, lens if any(lens) else None
 
 
 def _check_model(values: Mapping[str, Any], file: Path, k: int) -> None:
@@ -214,7 +226,7 @@ def _parse_pose(entry: Mapping[str, Any], undo: np.ndarray, file: Path, k: int) 
         return None
     if _is_lost(entry["transform_matrix"]):
         return np.full((4, 4), np.nan)
-    c2w = _parse_matrix(entry["transform_matrix"], file, f"frames.{k}.transform_matrix")
+    c2w = parse_matrix(entry["transform_matrix"], file, f"frames.{k}.transform_matrix")
     scale = np.linalg.norm(undo[:3, 0])
     c2w = undo @ c2w
     c2w[:3, :3] /= scale
@@ -228,7 +240,7 @@ def _is_lost(matrix: Any) -> bool:
     return any(cell is None or (isinstance(cell, float) and not math.isfinite(cell)) for cell in cells)
 
 
-def _parse_matrix(value: Any, file: Path, field: str) -> np.ndarray:
+def parse_matrix(value: Any, file: Path, field: str) -> np.ndarray:
     """3×4 or 4×4 numbers → (4, 4)."""
     n_rows = len(value) if isinstance(value, list) else 0
     if n_rows not in (3, 4):
@@ -242,7 +254,7 @@ def _parse_applied(meta: Mapping[str, Any], file: Path) -> tuple[np.ndarray, lis
     report = []
     applied = np.eye(4)
     if meta.get("applied_transform") is not None:
-        applied = _parse_matrix(meta["applied_transform"], file, "applied_transform")
+        applied = parse_matrix(meta["applied_transform"], file, "applied_transform")
         R = applied[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _MAX_ROTATION_ERROR or np.linalg.det(R) < 0:
             raise FormatError(file, "applied_transform", R.tolist(), "a rotation and a translation")

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from dhtorch.data.models import ModelView, SceneModel, Similarity
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import protocol
@@ -35,7 +36,6 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.geometry.sensor_noise import SENSORS, SensorNoise
-from dhtorch.measure.models import ModelView, SceneModel, Similarity
 from dhtorch.measure.scale import metric_scale
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dhtorch.data import FormatError
-from dhtorch.measure.models import Similarity, read_model, write_model
+from dhtorch.data.models import Similarity, read_model, write_model
 from tests.support import room_models as made
 
 WRITERS = {
@@ -77,7 +77,7 @@ def test_all_but_lengths_stays(tmp_path):
 
 
 def test_sizes_of_splats_grow_with_the_scale(tmp_path):
-    from dhtorch.viz.viewer.points import read_ply_vertices  # noqa: PLC0415
+    from dhtorch.runtime.ply import read_ply_vertices  # noqa: PLC0415
 
     _, folder = write(tmp_path, "splat")
     write_model(read_model(folder), tmp_path / "out", Similarity(2.0, np.eye(3), np.zeros(3)))

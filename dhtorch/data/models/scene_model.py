@@ -1,0 +1,123 @@
+"""A reconstruction up to scale: views (picture, camera, pose, depth map or observed points) and points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime import storage
+from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
+
+#: Suffixes of pictures of a model, of which files may leave out theirs.
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+class Similarity(NamedTuple):
+    """x' = scale · R x + t."""
+
+    scale: float
+    R: np.ndarray  # (3, 3)
+    t: np.ndarray  # (3,)
+
+    def apply(self, xyz: np.ndarray) -> np.ndarray:
+        """Points (…, 3) after the similarity."""
+        return self.scale * xyz @ self.R.T + self.t
+
+    def move(self, c2w: np.ndarray) -> np.ndarray:
+        """Camera-to-world matrices (…, 4, 4) after the similarity."""
+        moved = np.array(c2w, np.float64)
+        moved[..., :3, :3] = self.R @ moved[..., :3, :3]
+        moved[..., :3, 3] = self.apply(moved[..., :3, 3])
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class ModelView:
+    """A picture of a model: camera and pose in the model's units, and the depth or the points seen in it."""
+
+    name: str  # of the picture
+    K: np.ndarray  # (3, 3), pixel centres at integers
+    hw: tuple[int, int]  # that K refers to
+    c2w: np.ndarray  # (4, 4), OpenCV axes
+    distortion: tuple[float, ...] | None = None  # OpenCV's order
+    image: Path | None = None
+    depth: np.ndarray | None = None  # (h, w) of the same field of view, model units; 0 = none
+    point: np.ndarray | None = None  # (n,) int64, indices of observed points; None = not stored
+    uv: np.ndarray | None = None  # (n, 2) px, where they are observed
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A reconstruction up to scale."""
+
+    views: Sequence[ModelView]
+    xyz: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (P, 3) model units
+    format: str = "memory"
+    root: Path = Path()
+    save: Callable[[Path, Similarity], None] | None = field(default=None, repr=False)
+
+
+def write_model(model: SceneModel, out: Path, similarity: Similarity) -> None:
+    """Write the files of a model that was read into the folder ``out``, after a similarity.
+
+    What is no length stays as it is.
+
+    Raises:
+        ValueError: a model from memory, or a rotation of a splat, whose colours depend on the direction.
+    """
+    if model.save is None:
+        raise ValueError("write_model: found a model from memory, expected one that was read")
+    model.save(out, similarity)
+
+
+def find_picture(folder: Path, name: str, pictures: Path | None) -> Path | None:
+    """File of a picture below ``images/`` of the folder or up to two folders above it; None where there is none."""
+    above = [folder, *folder.resolve().parents[:2]]
+    for base in [pictures] if pictures is not None else [f / sub for f in above for sub in ("images", "rgb", "color")]:
+        for suffix in ("", *IMAGE_SUFFIXES):
+            file = files.resolve_inside(base, name + suffix, folder, "picture")
+            if file.is_file():
+                return file
+    return None
+
+
+def read_points(file: Path) -> PlyVertices:
+    """Points of a PLY file.
+
+    Raises:
+        FormatError: no such PLY.
+    """
+    try:
+        return read_ply_vertices(file)
+    except ValueError as error:
+        raise FormatError(file, "points", str(error).removeprefix(f"{file}: "), "a PLY with x, y and z") from None
+
+
+def write_points(file: Path, vertices: PlyVertices, similarity: Similarity) -> None:
+    """Write a PLY after a similarity: places, normals, and of splats the logarithms of their sizes.
+
+    Raises:
+        ValueError: a rotation of a splat.
+    """
+    vertex = vertices.vertex.copy()
+    names = vertex.dtype.names or ()
+    turned = not np.allclose(similarity.R, np.eye(3))
+    if turned and any(name.startswith(("f_rest_", "rot_")) for name in names):
+        raise ValueError(f"{file.name}: found a splat to be turned, expected frame=model: colours depend on direction")
+    for name, values in zip("xyz", similarity.apply(vertices.xyz).T, strict=True):
+        vertex[name] = values
+    normal = ("nx", "ny", "nz")
+    if turned and {*normal} <= {*names}:
+        normals = np.stack([vertex[n] for n in normal], 1).astype(np.float64) @ similarity.R.T
+        for name, values in zip(normal, normals.T, strict=True):
+            vertex[name] = values
+    for name in names:
+        if name.startswith("scale_"):
+            vertex[name] += np.log(similarity.scale)
+    storage.replace_file(file, vertices.encode(vertex))
