@@ -3,12 +3,17 @@
     python benchmarks/mutants.py                                   # every fault of benchmarks/faults/
     python benchmarks/mutants.py geometry.se3 stages.pose          # those of some modules
     python benchmarks/mutants.py --every 4                         # a quarter of each module's
-    python benchmarks/mutants.py --sweep 0.1 geometry              # a tenth of what the rules give instead
+    python benchmarks/mutants.py --sweep 0.1 --seed 1f geometry    # a tenth of what the rules give instead
     python benchmarks/mutants.py --tests OLD/tests --json FILE     # the tests of another checkout
+    python benchmarks/mutants.py --among tests/viz viz             # of the tests that are named, those in tests/viz
+    python benchmarks/mutants.py --keyword "pose or lens" viz       # of these, those that pytest -k selects
+    python benchmarks/mutants.py --list                            # faults per 1,000 lines of a package, nothing run
 
 A fault is caught when a test of the module itself fails. Faults are named by function and by the text that is replaced,
 never by line, so they survive moves; a text that is no longer there, or there twice, is an error. The copy is thrown
-away. Every fault is tried in a process of its own, forked from one that has torch loaded.
+away. Every fault is tried in a process of its own, forked from one that has torch loaded. A fault in C++ is compiled
+in the copy; files without one come from a cache beside it. ``--json`` keeps the rows of FILE whose faults are still
+listed and were not tried again.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from __future__ import annotations
 import argparse
 import ast
 import gc
+import itertools
 import json
 import os
 import random
@@ -38,8 +44,43 @@ from faults.rows import Fault
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Folders and files of the package that faults are planted in.
+#: Folders and files of the package that faults are planted in: all that computes or converts; of the laboratory what
+#: others are measured with.
 PLACES = (
+    "alignment",
+    "calibration",
+    "cli",
+    "codes",
+    "data",
+    "export",
+    "extract",
+    "functional",
+    "geometry",
+    "integrate",
+    "losses",
+    "measure",
+    "metrics",
+    "ops",
+    "pipeline",
+    "pytree",
+    "records",
+    "runtime",
+    "stages",
+    "transforms",
+    "validation",
+    "viz",
+    "experiments/compare_methods",
+    "experiments/probes/ridge",
+)
+
+#: Parts of the package that no answer is computed or converted in, or only for tests and studies.
+UNPLANTED = {"synthetic", "testing"}
+
+#: Fewest hand-written faults of a package per 1,000 lines of its code.
+MIN_DENSITY = 12
+
+#: Those of them in which every module has a fault of its own.
+METHOD = (
     "records",
     "stages",
     "geometry",
@@ -76,6 +117,9 @@ PLACES = (
     "extract",
 )
 
+#: pytest's ``-k`` of this run.
+KEYWORD = [""]
+
 #: What the tests of a trial leave in its tree.
 FAILURE, TIMES = "first_failure.txt", "seconds.json"
 
@@ -102,15 +146,38 @@ LEFT = (
 # ------------------------------------------------------------------------------------------------ where a fault goes
 
 
-def modules(root: Path = ROOT) -> dict[str, Path]:
-    """Modules of the places by dotted name below the package."""
+def modules(root: Path = ROOT, places: Sequence[str] = PLACES) -> dict[str, Path]:
+    """Modules of some places by dotted name below the package, C++ sources included."""
     files = {}
-    for place in PLACES:
+    for place in places:
         base = root / "dhtorch" / place
-        for path in [base.with_suffix(".py")] if base.with_suffix(".py").exists() else sorted(base.rglob("*.py")):
-            parts = path.relative_to(root / "dhtorch").with_suffix("").parts
-            files[".".join(p for p in parts if p != "__init__")] = path
+        sources = [base.with_suffix(".py")] if base.with_suffix(".py").exists() else base.rglob("*.[ch]*")
+        python = [] if base.with_suffix(".py").exists() else base.rglob("*.py")
+        for path in sorted([*sources, *python]):
+            if path.suffix in (".py", ".cpp", ".h"):
+                parts = path.relative_to(root / "dhtorch").with_suffix("").parts
+                files[".".join(p for p in parts if p != "__init__")] = path
     return files
+
+
+def package_of(module: str) -> str:
+    """The package that a module lies in; compiled sources and laboratory modules count apart."""
+    first, *rest = module.split(".")
+    return f"{first}.csrc" if rest[:1] == ["csrc"] else first
+
+
+def code_lines(path: Path) -> int:
+    """Lines of a file that hold code: no blank line, comment, docstring or import."""
+    text = path.read_text().splitlines()
+    if path.suffix != ".py":
+        return sum(1 for line in text if line.strip() and not line.strip().startswith(("//", "#")))
+    rows: set[int] = set()
+    for node in ast.walk(ast.parse("\n".join(text))):
+        is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if isinstance(node, ast.stmt) and not is_text and not isinstance(node, ast.Import | ast.ImportFrom):
+            body = getattr(node, "body", None)
+            rows.update(range(node.lineno, body[0].lineno if body else (node.end_lineno or 0) + 1))
+    return sum(1 for row in rows if text[row - 1].strip() and not text[row - 1].strip().startswith(("#", '"""')))
 
 
 def module_of(name: str, known: Iterable[str]) -> str:
@@ -133,7 +200,9 @@ def within(places: Sequence[str], known: Iterable[str]) -> list[str]:
 
 
 def span(source: str, function: str) -> tuple[int, int]:
-    """Where the definition of ``function`` begins and ends, in characters."""
+    """Where the definition of ``function`` begins and ends, in characters; of Python, else of C++."""
+    if _is_cpp(source):
+        return _cpp_span(source, function)
     body: Sequence[ast.stmt] = _parsed(source).body
     lines = source.splitlines(keepends=True)
     offset = [0]
@@ -147,6 +216,24 @@ def span(source: str, function: str) -> tuple[int, int]:
         body = getattr(node, "body", [])
     first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", []))])
     return offset[first - 1], offset[node.end_lineno]
+
+
+def _is_cpp(source: str) -> bool:
+    return source.startswith(("//", "#include", "#pragma"))
+
+
+def _cpp_span(source: str, function: str) -> tuple[int, int]:
+    """From the name of a function (or of what is assigned) to the end of its braces or statement."""
+    begin = re.search(rf"\b{re.escape(function)}\s*(\([^;{{}}]*\)[^;{{}}()]*\{{|=)", source)
+    if begin is None:
+        raise ValueError(f"mutants: no {function} to plant a fault in")
+    if begin.group().endswith("="):
+        return begin.start(), source.index(";", begin.end())
+    depth, at = 1, begin.end()
+    while depth:
+        depth += {"{": 1, "}": -1}.get(source[at], 0)
+        at += 1
+    return begin.start(), at
 
 
 @lru_cache(maxsize=4)
@@ -180,7 +267,8 @@ def planted(source: str, fault: Fault) -> str:
     first, last = placed(source, fault)
     inside = source[first:last]
     changed = source[:first] + inside.replace(fault.old, fault.new) + source[last:]
-    ast.parse(changed)
+    if not _is_cpp(source):
+        ast.parse(changed)
     return changed
 
 
@@ -195,11 +283,24 @@ _SWAPS: dict[type, tuple[str, str]] = {
 
 _TWINS = {"minimum": "maximum", "sin": "cos", "amin": "amax", "any": "all", "argmin": "argmax", "min": "max"}
 _TWINS |= {"clamp_min": "clamp_max", "zeros_like": "ones_like", "mean": "sum", "floor": "ceil", "cumsum": "flip"}
+_TWINS |= {"width": "height", "left": "right", "first": "last", "start": "end", "logical_and": "logical_or"}
+_TWINS |= {"isfinite": "isnan", "startswith": "endswith", "argmax": "argmin", "sum": "mean", "rows": "columns"}
 _TWINS |= {b: a for a, b in _TWINS.items()}
+
+#: Calls of a name, not of an attribute.
+_NAME_TWINS = {"any": "all", "all": "any", "min": "max", "max": "min", "sorted": "list"}
 
 
 def by_rule(source: str, module: str) -> Iterator[Fault]:
-    """Every operator exchanged, number changed, sign and negation dropped: one fault each, where the text is unique."""
+    """One fault for each change of the rules, where the text that it replaces is unique.
+
+    Operators exchanged, numbers changed (indices, axes and units among them), signs and negations dropped, conditions
+    inverted, ``any`` for ``all``, the first element for one that a variable names, a keyword argument, an entry of a
+    tuple or of a dictionary left out.
+    """
+    if _is_cpp(source):
+        yield from _cpp_by_rule(source, module)
+        return
     for function in _functions(ast.parse(source)):
         first, last = span(source, function)
         inside = source[first:last]
@@ -210,6 +311,17 @@ def by_rule(source: str, module: str) -> Iterator[Fault]:
                 old, changed = _around(flat, statement, a, b, new)
                 if inside.count(old) == 1 and old != changed:
                     yield Fault(module, function, old, changed)
+
+
+def _cpp_by_rule(source: str, module: str) -> Iterator[Fault]:
+    """Every spaced operator of a C++ function exchanged."""
+    swaps = {" + ": " - ", " - ": " + ", " * ": " / ", " < ": " > ", " > ": " < ", " && ": " || ", " || ": " && "}
+    for function in dict.fromkeys(re.findall(r"^(?!namespace)[\w:<>,&* ]*?(\w+)\([^;{}]*\)\s*\{$", source, re.M)):
+        first, last = _cpp_span(source, function)
+        inside = source[first:last]
+        for line in (x.strip() for x in inside.splitlines()[1:]):
+            for old in (o for o in swaps if line.count(o) == 1 and inside.count(line) == 1):
+                yield Fault(module, function, line, line.replace(old, swaps[old]))
 
 
 def _functions(tree: ast.Module) -> Iterator[str]:
@@ -251,12 +363,37 @@ def _changes(node: ast.AST, lines: list[str]) -> Iterator[tuple[int, tuple[int, 
     if isinstance(node, ast.Constant) and type(node.value) is bool:
         a, b = _column(lines[row], node.col_offset), _column(lines[row], node.end_col_offset or 0)
         yield row, (a, b), str(not node.value)
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Invert):
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Invert | ast.Not):
         a = _column(lines[row], node.col_offset)
-        yield row, (a, a + 1), " "
+        yield row, (a, _column(lines[row], node.operand.col_offset)), " "
     if isinstance(node, ast.Attribute) and node.attr in _TWINS:
         b = _column(lines[row], node.end_col_offset or 0)
         yield row, (b - len(node.attr), b), _TWINS[node.attr]
+    yield from _omissions(node, row, lines[row])
+
+
+def _omissions(node: ast.AST, row: int, line: str) -> Iterator[tuple[int, tuple[int, int], str]]:
+    """The changes of ``_changes`` that invert a condition, leave an entry out, or take the first for the one named."""
+
+    def columns(first: Any, last: Any) -> tuple[int, int]:
+        return _column(line, first.col_offset), _column(line, last.end_col_offset)
+
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _NAME_TWINS:
+        yield row, columns(node.func, node.func), _NAME_TWINS[node.func.id]
+    if isinstance(node, ast.Call):
+        before = [*node.args, *node.keywords]
+        for previous, option in itertools.pairwise(before):
+            if isinstance(option, ast.keyword):
+                yield row, (columns(previous, previous)[1], columns(option, option)[1]), ""
+    if isinstance(node, ast.Tuple | ast.List) and len(node.elts) > 2 and isinstance(node.ctx, ast.Load):
+        yield row, (columns(node.elts[-2], node.elts[-2])[1], columns(node.elts[-1], node.elts[-1])[1]), ""
+    if isinstance(node, ast.Dict) and len(node.values) > 1:
+        yield row, (columns(node.values[-2], node.values[-2])[1], columns(node.values[-1], node.values[-1])[1]), ""
+    if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Name) and isinstance(node.ctx, ast.Load):
+        yield row, columns(node.slice, node.slice), "0"
+    if isinstance(node, ast.IfExp) and not isinstance(node.test, ast.BoolOp | ast.Compare):
+        a, b = columns(node.test, node.test)
+        yield row, (a, b), f"not {line[a:b]}"
 
 
 def _column(line: str, offset: int) -> int:
@@ -333,7 +470,7 @@ class Tried(NamedTuple):
 
 
 def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]) -> Tried:
-    """Run the module's tests over the tree in a fork."""
+    """Run the module's tests over the tree in a fork; a fault that C++ cannot be compiled with is caught."""
     failure, times = tree / FAILURE, tree / TIMES
     for path in (failure, times):
         path.unlink(missing_ok=True)
@@ -372,10 +509,12 @@ def _run_tests(tree: Path, module: str, tests: Sequence[str], order: Mapping[str
         os.dup2(log, 2)
         os.chdir(tree)
         os.environ |= {"PYTHONPATH": str(tree), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "DHTORCH_OPS": "0"}
+        if ".csrc." in module:
+            os.environ["CXX"] = f"{sys.executable} {Path(__file__).resolve().with_name('cached_compiler.py')}"
         sys.path[:0] = [str(tree)]
         import pytest
 
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow"]
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow", "-k", KEYWORD[0]]
         code = int(pytest.main([*options, *tests], plugins=[Order(module, order), Record(tree)]))
     finally:
         sys.stdout.flush()
@@ -453,15 +592,20 @@ def run(
 def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, Mapping[str, float]]:
     """Seconds that each test of every module takes as it is; they must pass."""
     free = list(benches)
+    known: dict[tuple[str, ...], Mapping[str, float]] = {}  # by the tests that are run, the same for any module
 
     def one(module: str) -> Mapping[str, float]:
         if module not in tests_of:
             raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
+        named = tuple(tests_of[module])
+        if named in known and not any("test_contract" in test for test in named):
+            return known[named]
         bench = free.pop()
         try:
             outcome = bench.run(None, module, tests_of[module], 600, {})
             if outcome.failed:
                 raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {outcome.why}")
+            known[named] = outcome.seconds
             return outcome.seconds
         finally:
             free.append(bench)
@@ -487,6 +631,49 @@ def by_module(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]
     ]
 
 
+def by_package(rows: Sequence[dict[str, Any]], faults: Sequence[Fault] = FAULTS) -> list[dict[str, Any]]:
+    """Of every package: lines of code, faults listed, and of those tried how many are to be caught, and were."""
+    known = modules()
+    lines, listed = Counter[str](), Counter[str]()
+    for name, path in known.items():
+        lines[package_of(name)] += code_lines(path)
+    for fault in faults:
+        listed[package_of(module_of(fault.module, known))] += 1
+    tried = Counter((package_of(row["module"]), row["verdict"]) for row in rows)
+    return [
+        {
+            "package": name,
+            "lines": lines[name],
+            "faults": listed[name],
+            "caught": tried[name, "caught"],
+            "of": tried[name, "caught"] + tried[name, "missed"],
+        }
+        for name in sorted(lines)
+    ]
+
+
+def density(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of ``by_package``."""
+    lines = [
+        f"{row['package']:16} {row['lines']:6} {row['faults']:6} {1000 * row['faults'] / max(1, row['lines']):9.1f}"
+        f" {row['caught']:6} {row['of']:6} {row['caught'] / row['of'] if row['of'] else float('nan'):7.1%}"
+        for row in rows
+    ]
+    return "\n".join([f"{'package':16} {'lines':>6} {'faults':>6} {'per 1,000':>9} {'caught':>6} {'of':>6}", *lines])
+
+
+def joined(before: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of earlier runs whose fault is still listed and was not tried again, and the new ones; by module."""
+
+    def key(row: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(row[name] for name in ("module", "function", "old", "new"))
+
+    known = modules()
+    listed = {(module_of(f.module, known), f.function, f.old, f.new): k for k, f in enumerate(FAULTS)}
+    latest = {key(row): row for row in [*before, *rows]}
+    return [latest[each] for each in sorted(latest.keys() & listed.keys(), key=lambda each: (each[0], listed[each]))]
+
+
 def summary(rows: Sequence[dict[str, Any]]) -> str:
     """Caught of those that change an answer, by module."""
     counts = by_module(rows)
@@ -501,29 +688,42 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("modules", nargs="*", help="dotted names below dhtorch, or their beginnings; all of them")
     parser.add_argument("--sweep", type=float, default=0.0, help="draw this share of what the rules give instead")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", default="0", help="any text that the draw is to depend on, a commit for one")
+    parser.add_argument("--list", action="store_true", help="run nothing; print what is listed for every package")
     parser.add_argument(
         "--every", type=int, default=1, help="of each module's faults only every so many, the first too"
     )
     parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="folder of tests, this checkout's")
+    parser.add_argument("--among", default="", help="of the tests that are named, those below this path")
+    parser.add_argument("--keyword", default="", help="of these, those that match (pytest -k); misses are not recorded")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--quiet", action="store_true", help="print only what was missed")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     known = modules()
     wanted = within(args.modules, known) if args.modules else list(known)
+    if args.list:
+        print(density(by_package([])))
+        return 0
+    before = json.loads(args.json.read_text()) if args.json and args.json.exists() and not args.sweep else []
     if args.sweep:
-        drawn = [f for m in wanted for f in by_rule(known[m].read_text(), m)]
+        drawn = [f for m in wanted if m in TESTS for f in by_rule(known[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
     else:
         home = [(module_of(f.module, known), f) for f in FAULTS]
         faults = [f for m in wanted for f in [f for place, f in home if place == m][:: args.every]]
+    KEYWORD[0] = args.keyword
     rows = []
-    for row in run(faults, TESTS, args.tests, args.jobs, args.quiet):
+    named = {module: [test for test in tests if test.startswith(args.among)] for module, tests in TESTS.items()}
+    faults = [fault for fault in faults if named[module_of(fault.module, known)]]
+    for row in run(faults, named, args.tests, args.jobs, args.quiet):
         rows.append(row)
         if args.json:  # at once: what was tried in an hour is not lost with the next
-            args.json.write_text(json.dumps(rows, indent=1) + "\n")
+            sure = [row for row in rows if not (args.among or args.keyword) or row["verdict"] == "caught"]
+            so_far = rows if args.sweep else joined(before, sure)
+            args.json.write_text(json.dumps(so_far, indent=1) + "\n")
     print(summary(rows))
+    print(density(by_package(rows, faults)))
     return int(any(row["verdict"] == "noticed" for row in rows))
 
 

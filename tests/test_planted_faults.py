@@ -44,8 +44,51 @@ def test_every_module_with_a_fault_names_tests_that_exist():
 
 def test_every_module_of_the_method_has_a_fault():
     spoken_of = {mutants.module_of(fault.module, KNOWN) for fault in FAULTS}
-    empty = {name for name, path in KNOWN.items() if "def " not in path.read_text()}
-    assert set(KNOWN) - spoken_of - empty == set()
+    method = mutants.modules(places=mutants.METHOD)
+    empty = {name for name, path in method.items() if "def " not in path.read_text()}
+    assert set(method) - spoken_of - empty == set()
+
+
+def test_every_package_has_its_share_of_faults():
+    sparse = [
+        (row["package"], row["lines"], row["faults"])
+        for row in mutants.by_package([])
+        if row["faults"] < mutants.MIN_DENSITY * row["lines"] / 1000
+    ]
+    assert not sparse
+
+
+def test_a_package_of_the_tree_is_listed_or_left_out_by_name():
+    top = {path.stem for path in (REPO / "dhtorch").iterdir() if not path.name.startswith((".", "_"))} - {"py"}
+    assert top - {place.split("/")[0] for place in mutants.PLACES} == mutants.UNPLANTED
+
+
+def test_a_run_of_one_package_keeps_the_rows_of_the_others():
+    one, other = (
+        {"module": mutants.module_of(f.module, KNOWN), "function": f.function, "old": f.old, "new": f.new}
+        for f in (FAULTS[0], FAULTS[-1])
+    )
+    gone = one | {"old": "a text that no fault has", "verdict": "caught"}
+    before = [one | {"verdict": "missed"}, other | {"verdict": "caught"}, gone]
+    rows = mutants.joined(before, [one | {"verdict": "caught"}])
+    assert sorted(row["module"] for row in rows) == sorted([one["module"], other["module"]])
+    assert {row["verdict"] for row in rows} == {"caught"}
+
+
+def test_rules_leave_out_options_and_take_the_first_for_each():
+    source = "def f(x, k):\n    return g(x[k], scale=2) if x else any(h(x, k, 1))\n"
+    changed = {fault.new for fault in mutants.by_rule(source, "m")}
+    for part in ("g(x[0], scale=2)", "g(x[k])", "if not x else", "all(h(x, k, 1))", "h(x, k, 2)", "scale=3"):
+        assert any(part in line for line in changed), part
+
+
+def test_a_fault_in_cpp_is_placed_within_its_function():
+    source = "// a\nconstexpr int kSize = 3;\nstatic int add(int a,\n    int b) {\n  if (a) { b += 1; }\n  return a + b;\n}\n"
+    changed = mutants.planted(source, Fault("m", "add", "a + b", "a - b"))
+    assert changed == source.replace("a + b", "a - b")
+    assert "kSize = 4" in mutants.planted(source, Fault("m", "kSize", "3", "4"))
+    with pytest.raises(ValueError, match="no subtract"):
+        mutants.placed(source, Fault("m", "subtract", "a", "b"))
 
 
 def test_what_does_not_fit_is_refused():

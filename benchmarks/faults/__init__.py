@@ -13,14 +13,19 @@ from faults import (
     judging,
     kornia,
     pose_priors,
+    reading,
     ruling,
     solving,
     sweeping,
     windows,
+    writing,
 )
 from faults.rows import Fault, faults
 
-PARTS = (geometry, solving, windows, front, kornia, joining, pose_priors, sweeping, entry, enriching, judging, ruling)
+PARTS = (
+    *(geometry, solving, windows, front, kornia, joining, pose_priors),
+    *(sweeping, entry, enriching, judging, ruling, writing, reading),
+)
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
 

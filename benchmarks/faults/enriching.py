@@ -1,6 +1,10 @@
 """Data sets with depth beside every picture."""
 
-WHOLE = ["tests/cli/test_enrich.py", "tests/extract/test_enrich_guarantees.py"]
+WHOLE = [
+    "tests/extract/test_written_rows.py",
+    "tests/cli/test_enrich.py",
+    "tests/extract/test_enrich_guarantees.py",
+]
 
 TESTS: dict[str, list[str]] = {
     f"extract.{name}": WHOLE
@@ -32,6 +36,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_refuted_code", "1 + convention if", "convention if"),
         ("_quantise", ".clip(1)", ""),
         ("_compute_moments", "(depth, sigma)", "(sigma, depth)"),
+        ("MapRowDataset.features", "poses[i : i + 1]", "poses[max(i - 1, 0) : max(i, 1)]"),
     ],
     "extract.instants": [
         ("PeekableRows.take", 'row["frame_index"] != frame', 'row["frame_index"] > frame'),
@@ -42,6 +47,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("NerfstudioTarget.own", 'summary["key"] != self.key', "False"),
         ("NerfstudioTarget.assemble", 'row["depth"] and np.isfinite(row["pose"]).all()', 'row["depth"]'),
         ("_write_shot", "np.where(steps > 0, depth, 0)", "depth"),
+        ("_write_shot", "K, pose, view.lens, row", "K, pose, (), row"),
     ],
     "extract.origin": [
         ("LeRobotSource.splits", "int(first) <= k < int(last)", "int(first) <= k <= int(last)"),
@@ -69,10 +75,20 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("LeRobotTarget._summary", "list(tasks) if episode_tasks is None else episode_tasks", "list(tasks)"),
         ("LeRobotTarget._splits", "{indices[-1] + 1}", "{indices[-1]}"),
         ("LeRobotTarget._write_lenses", "if view.lens", ""),
+        ("LeRobotTarget._recording_rows", "start + index,", "index,"),
+        ("LeRobotTarget._recording_rows", "start + index,", "start + np.arange(len(kept)),"),
+        ("LeRobotTarget._recording_rows", "[shots[key] for shots in kept]", "[next(iter(x.values())) for x in kept]"),
+        ("LeRobotTarget._recording_rows", "all(row[", "any(row["),
+        ("LeRobotTarget._recording_rows", "(index / self.fps)", "(index * self.fps)"),
+        ("LeRobotTarget._recording_rows", "np.full(len(kept), k)", "np.full(len(kept), 0)"),
     ],
     "extract.step_set": [
         ("RldsSource.batches", "at / self.fps", "at"),
         ("RldsSource.batches", "if text not in tasks]", "]"),
+        ("RldsSource.batches", "at = np.array(part)", "at = np.arange(len(part))"),
+        ("RldsSource.batches", "_read_cells(steps, name, part)", "_read_cells(steps, name, range(len(part)))"),
+        ("RldsSource.batches", "tasks.index(text)", "texts.index(text)"),
+        ("_read_cells", "size = values.shape[1]", "size = values.shape[0]"),
         ("_column_name", 'f"source.{column}" if column in _RESERVED_COLUMNS else column', "column"),
         ("_read_cells", "content[:2] == _JPEG", "content[:2] != _JPEG"),
     ],

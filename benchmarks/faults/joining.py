@@ -163,6 +163,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_select_greedily", "added.flip(0).gather(0, index)", "added.gather(0, index)"),
     ],
     "pipeline.stream": [
+        ("Stream.push", "torch.tensor(list(reversed(steps)), device", "torch.tensor(steps, device"),
+        ("Stream.push", "for s in reversed(steps)]", "for s in steps]"),
         ("Stream.push", "s <= len(self.past)", "s < len(self.past)"),
         ("Stream.push", "reversed(steps)]  # in", "steps]  # in"),
         ("Stream.push", "self.cuts.append(self.pushed)", "self.cuts.append(self.pushed + 1)"),

@@ -12,6 +12,7 @@ TESTS: dict[str, list[str]] = {
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "stages.pose_prior": [
+        ("check_pose_prior", "FIT_SIGMA_INFLATION**2 * own_cov", "FIT_SIGMA_INFLATION * own_cov"),
         (
             "check_pose_prior",
             "refuted, no_baseline = refuted | (enough_near & fit.ok & deviates)",
@@ -79,6 +80,17 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_leave_inference_mode", "x.clone() if", "x if"),
     ],
     "transforms.poses": [
+        (
+            "read_pose_priors",
+            "_read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)",
+            "_read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[0], at[0])",
+        ),
+        ("read_pose_priors", "relative_covariance(world_1, *covs)", "relative_covariance(world_1, *covs[::-1])"),
+        (
+            "_read_matrix",
+            "x[:, at if x.shape[1] > 1 else 0]",
+            "x[:1, at if x.shape[1] > 1 else 0].expand(len(x), -1, -1)",
+        ),
         ("check_constant_pose", 'or kind != "1_from_0"', ""),
         ("parse_pose_sigmas", "0 <= s < ", "0 < s < "),
         ("read_pose_priors", "keys[1] or name", "name"),

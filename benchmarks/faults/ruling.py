@@ -108,6 +108,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_local_variance", "mass + options.empty_kernel_weight", "mass + 1e-9"),
     ],
     "alignment.align": [
+        ("align_depth", "within=points.within / unit", "within=points.within"),
         ("align_depth", "(x > 0) if kind", "(x == x) if kind"),
         ("align_depth", "hw or (x.shape[-2], x.shape[-1])", "(x.shape[-2], x.shape[-1])"),
         ("align_depth", 'of_depth=kind != "inverse"', "of_depth=True"),
@@ -140,6 +141,15 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("name_causes", "bleeds & ~_is_wide(wrong & ~flying, steps)", "bleeds"),
     ],
     "validation.evidence": [
+        ("_splat_on_surface", "/ depth_at[..., None].clamp_min(1e-9)", "/ depth_at[:1, :, None].clamp_min(1e-9)"),
+        ("_splat_on_surface", "index[:, None].expand_as(weighted)", "index[:1, None].expand_as(weighted)"),
+        (
+            "_splat_on_surface",
+            "depth.flatten(1).gather(1, index)",
+            "depth[:1].flatten(1).expand(B, -1).gather(1, index)",
+        ),
+        ("sparse_evidence", "(total > 0) & (depth > 0)", "(total > 0).any(0) & (depth > 0)"),
+        ("triangulated_depth", "total > 0, (", "total[:1] > 0, ("),
         ("validation_references", "samples.usable & ((samples.flag", "samples.usable | ((samples.flag"),
         ("validation_references", "& ~returned", ""),
         ("resolution_sigma", "row_weight[:, None] * down + column_weight * across", "down + across"),
@@ -158,6 +168,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_splat_on_surface", "same_surface & inside", "inside"),
     ],
     "validation.faults": [
+        ("KNOWN_FAULTS", "'right' if x > 0 else 'left'", "'left' if x > 0 else 'right'"),
+        ("KNOWN_FAULTS", "'late' if k > 0 else 'early'", "'early' if k > 0 else 'late'"),
+        ("KNOWN_FAULTS", "{1 / factor:.2f}", "{factor:.2f}"),
         ("UNIT_FACTORS", '"mm read as m": 1e-3', '"mm read as m": 1e-2'),
         ("rot90_map", "torch.rot90(depth, quarters,", "torch.rot90(depth, -quarters,"),
         ("_inverse", "torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)", "depth"),
@@ -245,6 +258,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_lag_text", '"late" if lag > 0 else "early"', '"early" if lag > 0 else "late"'),
     ],
     "validation.validate": [
+        ("_view_evidences", "other_maps.to(grid)[n, batch]", "other_maps.to(grid)[n[0], batch]"),
+        ("_view_evidences", "for n in number]", "for n in index]"),
+        ("_view_evidences", "_renumber_views(maps, number)", "_renumber_views(maps, index)"),
+        ("_scale_vs_trajectory", "+ noise.square() ", ""),
+        ("_scale_vs_trajectory", "spread.square() + ", ""),
+        ("_scale_vs_trajectory", "baseline / trajectory_baseline", "trajectory_baseline / baseline"),
         ("combine_evidence", "torch.where(wrong & consistent, State.CANNOT_KNOW, state)", "state"),
         (
             "combine_evidence",

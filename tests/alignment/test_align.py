@@ -413,3 +413,15 @@ def test_options_change_what_they_name():
     many = AlignmentOptions(min_references=10_000)
     assert (align_depth(x, [near, far], options=many).gate == Gate.NO_POSE).all()
     assert torch.equal(align_depth(x, [near, far], options=AlignmentOptions()).sigma, plain.sigma)
+
+
+@pytest.mark.parametrize("kind", ["scale", "affine", "inverse"])
+def test_the_unit_of_a_map_without_one_changes_nothing(kind):
+    """References between unlike pixels are as uncertain as their surroundings differ, in any unit of the map."""
+    truth, samples, far = world(noise=0.003)
+    rough = truth * (1 + 0.1 * torch.rand(1, *HW, generator=torch.Generator().manual_seed(1), dtype=truth.dtype))
+    values = 1 / rough if kind == "inverse" else rough
+    plain, large = (align_depth(factor * values, [samples, far], kind=kind) for factor in (1.0, 1000.0))
+    assert plain.keep.any()
+    torch.testing.assert_close(large.depth, plain.depth, rtol=1e-6, atol=0, equal_nan=True)
+    torch.testing.assert_close(large.sigma, plain.sigma, rtol=1e-6, atol=0, equal_nan=True)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Hole, Source
-from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
+from dhtorch.export import ColmapImage, Shape, nerfstudio, write_colmap, write_glb, write_ply
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera
@@ -312,3 +312,46 @@ def written(folder, shot, xyz, rgb, error, seen, uv):
     write_colmap(folder, [shot], xyz, rgb=rgb, error=error, seen_by=seen[:, :1], uv=uv[:, :1])
     lines = [x for x in (folder / "images.txt").read_text().splitlines() if not x.startswith("#")]
     return lines[::2]
+
+
+def test_a_track_names_the_observation_of_its_point(tmp_path):
+    """POINT2D_IDX counts from 0 among the observations of its image, IMAGE_ID and POINT3D_ID from 1."""
+    shots, xyz, rgb, error, seen, uv = model(None, n=12)
+    seen[0, 0], seen[3, 1], xyz[5, 0] = -1, -1, math.nan
+    write_colmap(tmp_path, shots, xyz, rgb=rgb, error=error, seen_by=seen, uv=uv)
+    lines = {
+        name: [x for x in (tmp_path / name).read_text().split("\n")[:-1] if not x.startswith("#")]
+        for name in ("images.txt", "points3D.txt")
+    }
+    observed = {
+        int(head.split()[0]): [tuple(row.split()[k : k + 3]) for k in range(0, len(row.split()), 3)]
+        for head, row in zip(lines["images.txt"][::2], lines["images.txt"][1::2], strict=True)
+    }
+    assert sorted(observed) == [1, 2] and [len(observed[k]) for k in (1, 2)] == [10, 10]
+    named = set()
+    for line in lines["points3D.txt"]:
+        number, track = line.split()[0], line.split()[8:]
+        for image, place in zip(map(int, track[::2]), map(int, track[1::2]), strict=True):
+            assert observed[image][place][2] == number
+            named.add((image, place))
+    assert named == {(image, place) for image in observed for place in range(10)}
+
+
+def test_a_frame_of_nerfstudio_has_its_lens_pose_and_centre():
+    K, T = np.array([[50.0, 0, 20], [0, 60, 10], [0, 0, 1]]), np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    shot = nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T, (0.1, -0.2, 0.01, 0.02, 0.3), 4.5)
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "timestamp", "k1", "k2", "p1", "p2", "k3")
+    assert [shot[name] for name in names] == [50, 60, 20.5, 10.5, 40, 30, 4.5, 0.1, -0.2, 0.01, 0.02, 0.3]
+    assert shot["transform_matrix"] == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]
+    assert not {"k1", "timestamp"} & set(nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T))
+    with pytest.raises(ValueError, match="found 6 distortion coefficients"):
+        nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T, (0, 0, 0, 0, 0, 0.1))
+
+
+def test_depth_and_confidence_of_nerfstudio_are_steps_of_a_millimetre_and_a_share():
+    depth = np.array([[0.0, 0.0004, 0.0006, 1.2344, 65.534, 65.536]])
+    assert nerfstudio.quantise_nerfstudio_depth(depth).tolist() == [[0, 0, 1, 1234, 65534, 0]]
+    sigma = np.array([[1.0, 0.1, 0.2, 0.0, 1000.0]])
+    confidence = nerfstudio.encode_confidence(np.array([[0.0, 1.0, 2.0, 1.0, 1.0]]), sigma)
+    assert confidence.tolist() == [[0, 128, 128, 255, 1]]

@@ -1,6 +1,7 @@
 """Poses from elsewhere: held against near returns, in sigma, in samples; what a wrong one is called."""
 
 import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,8 +14,9 @@ from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, InitialPose, Pose, PosePrior, Samples, Tracks
+from dhtorch.records import Camera, InitialPose, Pose, PoseFit, PosePrior, Samples, Tracks
 from dhtorch.stages import pose_prior
+from dhtorch.stages.pose_prior import check_pose_prior, make_prior
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleError, poses
 
@@ -423,3 +425,48 @@ def test_a_given_pose_is_a_record():
         isinstance(pose_prior.make_prior(T, refine=True)[0:1], InitialPose)
         and pose_prior.make_prior(T).hypotheses.t.shape[1] == 42
     )
+
+
+@pytest.mark.parametrize(("deviation", "refuted"), [(0.9, False), (1.1, True)])
+def test_the_standard_deviation_of_a_fit_counts_threefold(deviation, refuted):
+    """A given pose is refuted beyond 4.74 deviations of both, that of near returns taken three times."""
+    sigma, draw = 1e-3, torch.Generator().manual_seed(0)
+    camera = Camera(torch.tensor([[500.0, 500.0]]).double(), torch.tensor([[320.0, 240.0]]).double())
+    z = 1 + torch.rand(1, 40, generator=draw).double()
+    uv = torch.rand(1, 40, 2, generator=draw).double() * torch.tensor([600.0, 440.0])
+    xyz = cam.unproject(camera, uv, z)
+    own = se3.exp(torch.tensor([[0.01, -0.02, 0.005, 0.2, 0.01, -0.03]]).double())
+    zero, one = torch.zeros_like(z), torch.ones_like(z)
+    samples = Samples(uv, z, 0.01 * z, xyz, one, zero.int(), one, zero.int())
+    uv_1 = cam.project(camera, se3.apply(own, xyz))
+    tracks = Tracks(uv, uv_1, zero, zero, torch.eye(2).double().expand(1, 40, 2, 2), one > 0)
+    numbers = [
+        torch.tensor([40]),
+        *(torch.tensor([x]).double() for x in (0.5, 0.5, 100.0)),
+        torch.tensor([PoseCode.OK]),
+    ]
+    fit = PoseFit(own, sigma**2 * torch.eye(6).double()[None], one > 0, *numbers)
+    xi = torch.zeros(1, 6).double()
+    xi[0, 4] = deviation * 4.74 * 3 * sigma
+    prior = make_prior(se3.compose(se3.exp(xi), own), cov=torch.full((1, 6, 6), 0.0).double() + 1e-12 * torch.eye(6))
+    checked = check_pose_prior(prior, samples, tracks, camera, camera, fit, max_residual=0.1)
+    assert (int(checked.code) == PoseCode.REFUTED) == refuted
+    assert refuted or int(checked.code) == PoseCode.OK
+
+
+def test_each_of_two_poses_has_its_own_covariance():
+    """Of every member of a batch and both frames, the covariance that stands beside the pose."""
+    draw = torch.Generator().manual_seed(0)
+    motion = se3.exp(0.2 * torch.rand(4, 6, generator=draw).double())
+    worlds = se3.to_matrix(motion).view(2, 2, 4, 4)  # (batch, time)
+    root = torch.rand(2, 2, 6, 6, generator=draw).double()
+    covs = root @ root.mT
+    values = {"pose": worlds, "cov": covs}
+    leaves = SimpleNamespace(sample=values, get=values.get, dtype=torch.float64, like=worlds)
+    options = {"cov": "cov", "kind": "world_from_cam", "axes": "cv", "unit": 1.0, "refine": False}
+    prior = poses.read_pose_priors(leaves, (1, [0]), (2, 2), [], keys=("pose", None), **options)[0]
+    for b in range(2):
+        world_0, world_1 = (se3.from_matrix(worlds[b : b + 1, at]) for at in (1, 0))
+        expected = conventions.relative_covariance(world_1, covs[b : b + 1, 1], covs[b : b + 1, 0])
+        torch.testing.assert_close(prior.cov[b : b + 1], expected)
+        torch.testing.assert_close(prior.T_1_from_0.t[b : b + 1], se3.relative(world_0, world_1).t)

@@ -19,6 +19,7 @@ from dhtorch.validation.evidence import (
     photometric_evidence,
     resolution_sigma,
     sparse_evidence,
+    triangulated_depth,
     validation_references,
 )
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
@@ -204,3 +205,22 @@ def test_maps_speak_only_between_views_that_stand_apart():
 
 def test_a_window_is_one_independent_pixel():
     assert DEFAULT_VALIDATION_OPTIONS.share_window_pixels == 81
+
+
+def test_a_batch_of_maps_is_judged_member_by_member():
+    draw = torch.Generator().manual_seed(3)
+    maps = [1 + k + torch.rand(1, *HW, generator=draw).cumsum(-1) / 9 for k in range(3)]
+    points = [
+        told((torch.rand(12, 2, generator=draw) * torch.tensor([31.0, 23.0])).tolist(), 1.2 + k, 0.01 + 0.02 * k)
+        for k in range(3)
+    ]
+    batch = ValidationReferences(*(torch.cat(part) for part in zip(*points, strict=True)))
+    together = sparse_evidence(torch.cat(maps), HW, batch, 0.02)
+    depths = triangulated_depth(torch.cat(maps), HW, batch)
+    for k in range(3):
+        alone = sparse_evidence(maps[k], HW, points[k], 0.02)
+        for name in ("misfit", "sure", "view"):
+            a, b = (getattr(x, name)[i] for x, i in ((together, k), (alone, 0)))
+            torch.testing.assert_close(a, b, equal_nan=True)
+        torch.testing.assert_close(depths[k], triangulated_depth(maps[k], HW, points[k])[0], equal_nan=True)
+        assert alone.misfit.isfinite().any() and depths[k].isfinite().any()

@@ -281,3 +281,26 @@ def test_what_a_motion_swallows_is_not_asked(frames, watched):
     inverse = next(cause.name for cause in KNOWN_FAULTS if cause.kind == "inverse")
     assert inverse not in own.loss
     assert inverse in beside.loss
+
+
+@pytest.mark.parametrize("fault", [c for c in KNOWN_FAULTS if " of the width too far " in c.name], ids=lambda c: c.name)
+def test_a_map_too_far_to_one_side_is_named_after_that_side(fault):
+    """A step at the middle, moved by the named share of the width to the named side, is at the middle when undone."""
+    w = 200
+    share, side = re.search(r"(\d+)% of the width too far (left|right)", fault.name).groups()
+    moved = w // 2 + round(w * int(share) / 100) * (1 if side == "right" else -1)
+    columns = torch.arange(w)
+    undone = fault.undo(torch.where(columns < moved, 1.0, 2.0).expand(1, 40, w))[0, 20]
+    valid = undone > 0
+    edge = int(columns[valid & (undone > 1.5)].min())
+    assert abs(edge - w // 2) <= 1
+
+
+def test_a_focal_length_and_a_lag_are_named_as_they_are():
+    for fault in KNOWN_FAULTS:
+        if fault.kind == "focal length":
+            ratio = float(re.search(r"focal length (\S+) of the true one", fault.name).group(1))
+            assert ratio * fault.focal == pytest.approx(1.0, abs=0.01), "undone, the focal length is the true one"
+        if fault.kind == "time offset":
+            count, word = re.search(r"(\d+) frames (late|early)", fault.name).groups()
+            assert fault.lag == int(count) * (1 if word == "late" else -1)

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from dhtorch.metrics.detection import auroc
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pytree import collate, stack
+from dhtorch.records import Pose
 from dhtorch.synthetic import SyntheticRoom
+from dhtorch.validation import validate
 from dhtorch.validation.evidence import Evidence
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 from dhtorch.validation.validate import (
@@ -396,3 +399,58 @@ def test_options_change_what_they_name(true, reference, others, sound):
     assert (harsh.state == State.WRONG).sum() > (sound.state == State.WRONG).sum()
     few = validate_depth(**maps, **SMALL, views=False, options=ValidationOptions(min_scale_references=10_000))
     assert few.scale.isnan().all()
+
+
+def test_maps_of_other_views_are_those_of_the_views_they_are_compared_with(monkeypatch):
+    """Six maps were passed; the method selected four of them and ranks these for each member of the batch."""
+    seen, B, hw = {}, 2, (6, 8)
+    number = torch.tensor([[5, 0], [3, 2], [1, 4], [0, 5]])  # of the selected views among those passed
+    index = torch.tensor([[2, 0], [0, 3]])  # the two most informative, by member
+    passed = torch.arange(6.0).view(6, 1, 1, 1) + 10 * torch.arange(B).view(1, B, 1, 1) + torch.ones(6, B, *hw)
+    fits = SimpleNamespace(ok=torch.ones(4, B, dtype=torch.bool), t_snr=torch.full((4, B), 9.0))
+    frames = SimpleNamespace(at=lambda k: k)
+    selected = SimpleNamespace(fits=fits, frames=frames)
+    grid = torch.ones(B, *hw)
+    base = SimpleNamespace(hw=hw, image=None)
+    monkeypatch.setattr(validate.plane_sweep, "make_reference_view", lambda *x: base)
+    monkeypatch.setattr(validate.dense, "downscale_grey", lambda *x: x)
+    monkeypatch.setattr(validate.dense, "top_views", lambda *x: (index, torch.ones(2, B, dtype=torch.bool)))
+    monkeypatch.setattr(validate.dense, "source_view_of", lambda selected, k, *more: k)
+    of_view = Evidence(torch.zeros_like(grid), grid > 0, torch.tensor([0, 1]).view(B, 1, 1).expand(B, *hw).int())
+    monkeypatch.setattr(validate.evidence, "photometric_evidence", lambda *x: of_view)
+
+    def consistency(grid, base, source_views, maps, tolerance, options):
+        seen.update(views=source_views, maps=maps)
+        return of_view
+
+    monkeypatch.setattr(validate.evidence, "depth_consistency_evidence", consistency)
+    validated = validate._ValidatedMap(grid, None, selected, number, False)
+    kinds = validate._view_evidences(validated, passed, 2, grid, DEFAULT_VALIDATION_OPTIONS)
+    for rank, (views, maps) in enumerate(zip(seen["views"], seen["maps"], strict=True)):
+        for b in range(B):
+            n = int(number[views[b], b])
+            assert bool((maps[b] == passed[n, b]).all()), (rank, b)
+    for kind in kinds:  # numbered among the views passed
+        assert [int(kind.view[b, 0, 0]) for b in range(B)] == [int(number[index[b, b], b]) for b in range(B)] == [1, 5]
+
+
+@pytest.mark.parametrize("snr", [20.0, 40.0, 1e6])
+def test_a_trajectory_measures_a_scale_no_better_than_its_baselines_are_known(snr):
+    V, spread = 3, 0.02
+    world = Pose(torch.eye(3).expand(1, 3, 3), torch.zeros(1, 3))
+    steps = torch.tensor([0.1, 0.2, 0.3])
+    t = torch.stack([steps, torch.zeros(V), torch.zeros(V)], -1)[:, None]
+    eye = torch.eye(3).expand(V, 1, 3, 3)
+    factor = 1.1 * torch.tensor([-spread, 0.0, spread]).exp()
+    fits = SimpleNamespace(
+        ok=torch.ones(V, 1, dtype=torch.bool),
+        t_snr=torch.full((V, 1), snr),
+        T_1_from_0=Pose(eye, -t * factor[:, None, None]),
+    )
+    frames = SimpleNamespace(T_world_from_cam=[Pose(eye[k], t[k]) for k in range(V)])
+    reference = SimpleNamespace(T_world_from_cam=world, camera=SimpleNamespace(f=torch.ones(1, 2)))
+    selected = SimpleNamespace(fits=fits, frames=frames)
+    ratio, low, high = validate._scale_vs_trajectory(reference, selected, DEFAULT_VALIDATION_OPTIONS)[0].tolist()
+    sd = math.sqrt((1.483 * spread) ** 2 + 1 / snr**2 + DEFAULT_VALIDATION_OPTIONS.trajectory_scale_sigma**2)
+    expected = validate._factor_interval(torch.tensor([math.log(1.1)]), torch.tensor([sd]))[0].tolist()
+    assert (ratio, low, high) == pytest.approx(expected, rel=1e-5) and ratio == pytest.approx(1.1)
