@@ -50,12 +50,13 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
     model = read_model(root, images=settings["images"])
     recording = scenes[0].recording
     options = ScaleOptions(max_frames=settings["max_frames"], tolerance=ScaleTolerance(settings["tolerance"]))
-    result = metric_scale(model, recording, sensor=settings["sensor"], cutoff=settings["cutoff"], options=options)
-    if settings["frame"] == "capture" and result.R is None:
-        raise ValueError("frame: found capture, expected model: the capture has no poses for the matched views")
-    plain = Similarity(result.scale, np.eye(3), np.zeros(3))
-    similarity = plain if settings["frame"] == "model" else result.similarity
-    with open_output_folder(out, "out"):
+    with open_output_folder(out, "out") as folder:
+        folder.check(out / name for name in ("scale.json", "scale.html"))
+        result = metric_scale(model, recording, sensor=settings["sensor"], cutoff=settings["cutoff"], options=options)
+        if settings["frame"] == "capture" and result.R is None:
+            raise ValueError("frame: found capture, expected model: the capture has no poses for the matched views")
+        plain = Similarity(result.scale, np.eye(3), np.zeros(3))
+        similarity = plain if settings["frame"] == "model" else result.similarity
         if result.ok:
             write_model(model, out, similarity)
         content = {"model": str(root), "format": model.format, "capture": recording.name, **describe_scale(result)}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import re
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -56,7 +55,7 @@ class FinishedScenes:
 
         def keep(scene: str, compute: Callable[[], Outcome]) -> Outcome:
             nonlocal n_scenes
-            name = f"{number}-{n_scenes}-{re.sub(r'[^A-Za-z0-9_.-]', '_', scene)}.pt"
+            name = f"{number}-{n_scenes}.pt"
             n_scenes += 1
             if self.folder is None:
                 return compute()

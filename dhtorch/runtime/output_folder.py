@@ -41,6 +41,12 @@ _BLOCK_BYTES = 1 << 20
 #: Size in the manifest of a file whose content another program writes: any content is dhtorch's own.
 _ANY_SIZE = -1
 
+#: Longest name of a file or folder. Source: NAME_MAX of Linux's and macOS's file systems, and of Windows.
+_MAX_NAME_BYTES = 255
+
+#: Suffix of a file while it is written beside its place; its name begins with a dot.
+UNFINISHED_SUFFIX = ".tmp"
+
 
 class FileIdentity(NamedTuple):
     """What identifies the content of a file: size, CRC-32, and CRC-32 of its first bytes."""
@@ -88,6 +94,7 @@ class OutputFolder:
 
         Raises:
             FileExistsError: the first link, foreign file or folder on the way to one of them.
+            OSError: the first name that is too long for the file system.
         """
         checked: set[Path] = set()
         for path in paths:
@@ -106,6 +113,7 @@ class OutputFolder:
 
         Raises:
             FileExistsError: the first link or file on the way.
+            OSError: the first name that is too long for the file system.
         """
         checked: set[Path] = set()
         for folder in folders:
@@ -123,6 +131,11 @@ class OutputFolder:
             return False
         identity = FileIdentity.of(path)
         return any(entry.covers(identity) for entry in entries)
+
+    def is_shortened(self, path: Path, size: int) -> bool:
+        """Whether the file of ``size`` bytes at ``path`` is one that dhtorch wrote, without its end."""
+        sizes = {entry.size for entry in self._entries.get(self._name(path), ())}
+        return bool(sizes) and not sizes & {size, _ANY_SIZE} and self.owns(path)
 
     def remove(self, path: Path) -> bool:
         """Remove the file at ``path`` if dhtorch wrote it and no link leads there -> whether it was removed."""
@@ -160,9 +173,15 @@ class OutputFolder:
         return folder / f"{next(self._numbers)}{suffix}"
 
     def _check_parents(self, path: Path, checked: set[Path]) -> None:
-        """Raise FileExistsError for a link or file among the folders between the root and ``path``."""
+        """Raise FileExistsError for a link or file among the folders between the root and ``path``, OSError for a name
+        that is too long."""
         parent = self.root
-        for part in Path(self._name(path)).parts[:-1]:
+        *folders, name = Path(self._name(path)).parts
+        for part in (*folders, name):
+            if (n_bytes := len(os.fsencode(part))) > _MAX_NAME_BYTES:
+                reason = f"{os.strerror(errno.ENAMETOOLONG)} ({n_bytes} bytes, at most {_MAX_NAME_BYTES})"
+                raise OSError(errno.ENAMETOOLONG, reason, f"{self.option}: {path}")
+        for part in folders:
             parent = parent / part
             if parent in checked:
                 continue
@@ -216,12 +235,14 @@ class OutputFolder:
             (self.private / _MANIFEST).unlink(missing_ok=True)
 
     def _remove_unfinished(self) -> None:
-        """Remove unfinished files, left by a killed process."""
-        folder = self.private / _UNFINISHED
+        """Remove unfinished files of the private folder, left by a killed process; links are not followed."""
+        unfinished = self.private / _UNFINISHED
+        for place, _, names in os.walk(self.private):
+            for name in names:
+                if Path(place) == unfinished or is_unfinished(name):
+                    Path(place, name).unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            for file in [] if folder.is_symlink() else list(folder.iterdir()):
-                file.unlink()
-            folder.rmdir()
+            unfinished.rmdir()
 
 
 #: Folders that this process has open, in the order of opening.
@@ -313,6 +334,27 @@ def find_output_folder(path: Path) -> OutputFolder | None:
         if find_relative_path(path, each.root) is not None and each.only in (None, path.absolute())
     ]
     return max(matches, key=lambda each: len(each.root.parts), default=None)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether there is a file with content at ``path`` that is no shortened file of the open folder it belongs to.
+
+    An empty or shortened output, as a crash of the system leaves it, counts as missing: it is written again. A file
+    that someone changed otherwise is whole.
+    """
+    try:
+        status = path.stat()
+    except OSError:
+        return False
+    if not stat.S_ISREG(status.st_mode) or not status.st_size:
+        return False
+    folder = find_output_folder(path)
+    return folder is None or not folder.is_shortened(path, status.st_size)
+
+
+def is_unfinished(name: str) -> bool:
+    """Whether a file of this name is one that was being written beside its place."""
+    return name.startswith(".") and name.endswith(UNFINISHED_SUFFIX)
 
 
 def is_private(path: Path) -> bool:

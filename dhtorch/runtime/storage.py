@@ -20,8 +20,8 @@ from dhtorch.runtime import output_folder
 #: Maximum nesting of lists and objects in a file, as they are traversed by recursion.
 _MAX_NESTING = 64
 
-#: Suffix of a file while it is written outside of an open output folder.
-_UNFINISHED_SUFFIX = ".tmp"
+#: Characters of a file's name in the name of its unfinished file. Source: chosen, enough to recognise it.
+_UNFINISHED_NAME_CHARACTERS = 32
 
 #: Permissions of a written file: readable by all, writable by its owner.
 _FILE_MODE = 0o644
@@ -146,8 +146,10 @@ def replace_at_end(path: str | Path) -> Iterator[Path]:
 
 
 def _name_unfinished(path: Path) -> Path:
-    """A new file beside ``path``."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED_SUFFIX, dir=path.parent)
+    """A new file beside ``path``, whose name is no longer than that of ``path`` may be."""
+    handle, name = tempfile.mkstemp(
+        prefix=f".{path.name[:_UNFINISHED_NAME_CHARACTERS]}.", suffix=output_folder.UNFINISHED_SUFFIX, dir=path.parent
+    )
     os.close(handle)
     return Path(name)
 
@@ -166,7 +168,7 @@ def has_files(folder: Path) -> bool:
     """Whether a folder or its subfolders hold a file, unfinished files and dhtorch's own records excluded."""
     inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
     files = (entry for entry in inside if not output_folder.is_private(entry.relative_to(folder)))
-    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED_SUFFIX)) for f in files)
+    return any(not output_folder.is_unfinished(f.name) for f in files)
 
 
 def _reject_constant(word: str) -> None:

@@ -3,8 +3,12 @@
 import json
 import multiprocessing
 import os
+import re
 import signal
+import socket
 import stat
+import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -225,6 +229,100 @@ def test_private_files_are_no_results(tmp_path):
     (tmp_path / "out" / "user.dhtorch").mkdir()
     (tmp_path / "out" / "user.dhtorch" / "a").write_text("mine")
     assert storage.has_files(tmp_path / "out")
+
+
+@pytest.mark.parametrize(("content", "is_whole"), [(b"", False), (CONTENT[:-1], False), (CONTENT, True), (b"x", True)])
+def test_an_empty_or_shortened_file_counts_as_missing_and_an_edited_one_does_not(tmp_path, content, is_whole):
+    out = tmp_path / "out"
+    write(out, a=CONTENT)
+    (out / "a").write_bytes(content)
+    with open_output_folder(out, "out"):
+        assert output_folder.is_whole(out / "a") == is_whole
+        assert not output_folder.is_whole(out / "b") and not output_folder.is_whole(out)
+    assert output_folder.is_whole(out / "a") == bool(content), "without the manifest only an empty one is known"
+
+
+def test_unfinished_private_files_of_a_dead_process_are_removed_by_the_next(tmp_path):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    write(out, a=CONTENT)
+    elsewhere.mkdir()
+    (out / PRIVATE_FOLDER / "shards").mkdir()
+    for folder in (out / PRIVATE_FOLDER / "shards", elsewhere, out):
+        (folder / ".shard.parquet.0123.tmp").write_bytes(b"half")
+        (folder / "shard.parquet").write_bytes(b"whole")
+    (out / PRIVATE_FOLDER / "link").symlink_to(elsewhere)
+    write(out, a=b"new")
+    left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.tmp")}
+    assert left == {"elsewhere/.shard.parquet.0123.tmp", "out/.shard.parquet.0123.tmp"}, "of others"
+    assert (out / PRIVATE_FOLDER / "shards" / "shard.parquet").is_file()
+
+
+@pytest.mark.parametrize("name", ["x" * 256, "é" * 128, f"folder/{'x' * 256}", f"{'x' * 256}/file"])
+def test_a_name_that_is_too_long_is_refused_before_anything_is_written(tmp_path, name):
+    with open_output_folder(tmp_path / "out", "out") as folder:
+        with pytest.raises(OSError, match=r"File name too long \(256 bytes, at most 255") as error:
+            folder.check([tmp_path / "out" / "a", tmp_path / "out" / name])
+        assert error.value.filename == f"out: {tmp_path / 'out' / name}"
+        storage.replace_file(tmp_path / "out" / ("x" * 250 + ".json"), CONTENT)
+    storage.replace_file(tmp_path / ("x" * 250 + ".json"), CONTENT)  # outside of all
+    page = tmp_path / ("x" * 245 + ".html")  # its private folder has a longer name
+    with pytest.raises(OSError, match="File name too long"), open_output_file(page, "html"):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "x" * 250 + ".json"]
+
+
+def _race(folder: Path, start: object, end: object, number: int) -> None:
+    start.wait()  # type: ignore[attr-defined]
+    try:
+        write(folder, a=b"%d" % number, depth__b=b"%d" % number)
+    except BlockingIOError as error:
+        end.put((number, str(error)))  # type: ignore[attr-defined]
+    else:
+        end.put((number, ""))  # type: ignore[attr-defined]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_of_fifty_that_race_each_is_refused_in_a_line_or_right(tmp_path):
+    out, context = tmp_path / "out", multiprocessing.get_context("fork")
+    start, end = context.Event(), context.SimpleQueue()
+    processes = [context.Process(target=_race, args=(out, start, end, k)) for k in range(50)]
+    for process in processes:
+        process.start()
+    start.set()
+    ends = dict(end.get() for _ in processes)
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    winners = {b"%d" % number for number, refusal in ends.items() if not refusal}
+    assert all("another dhtorch process" in line and "\n" not in line for line in ends.values() if line)
+    files = contents(out)
+    assert set(files) == {"a", "depth/b"} and files["a"] == files["depth/b"] and files["a"] in winners
+    assert [p.name for p in (out / PRIVATE_FOLDER).iterdir()] == ["manifest"]
+    with open_output_folder(out, "out") as folder:
+        assert folder.owns(out / "a") and folder.owns(out / "depth" / "b")
+
+
+def test_the_refusal_names_the_owner_and_since_when(tmp_path, monkeypatch):
+    out, context = tmp_path / "out", multiprocessing.get_context("fork")
+    ready = context.Event()
+    other = context.Process(target=_hold, args=(out, ready))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        other.start()
+    try:
+        assert ready.wait(30)
+        now = time.time()
+        monkeypatch.setattr(time, "time", lambda: now + 7)
+        owner = rf"another dhtorch process \({other.pid} on {re.escape(socket.gethostname())}, for [78] s\)"
+        with pytest.raises(BlockingIOError, match=f"^out: {out}: found {owner} writing there"):
+            write(out, a=b"1")
+        for record in (b"", b"{", b'{"process": 1}', b"[" * 900, b'{"process": "\xff", "host": 1, "since": 1e999}'):
+            (out / PRIVATE_FOLDER / "lock").write_bytes(record)
+            with pytest.raises(BlockingIOError, match="found another dhtorch process writing there"):
+                write(out, a=b"1")
+    finally:
+        other.kill()
+        other.join()
 
 
 def _hold(folder: Path, ready: object) -> None:
