@@ -39,7 +39,7 @@ from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
-from dhtorch.runtime.output_folder import open_output_folder
+from dhtorch.runtime.output_folder import is_whole, open_output_folder
 from dhtorch.viz.plots import draw_completed
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -323,7 +323,7 @@ def _encode_arrays(depth_map: DepthMap) -> bytes:
 
 def _write_extras(task: CompletionTask, i: int) -> None:
     """Write the missing figure and point files of a frame, from its written maps."""
-    missing = [path for path in task.extras(i) if not path.is_file()]
+    missing = [path for path in task.extras(i) if not is_whole(path)]
     if not missing:
         return
     maps, source = completed.read_completed_maps(task, i)

@@ -23,7 +23,7 @@ from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
+from dhtorch.runtime.output_folder import OutputFolder, is_whole, open_output_folder
 from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
@@ -79,7 +79,7 @@ class CompletionTask:
 
     def missing(self, i: int) -> bool:
         """Whether a file of frame ``i`` is missing."""
-        return self.name(i) not in self.done or not all(path.is_file() for path in self.extras(i))
+        return self.name(i) not in self.done or not all(map(is_whole, self.extras(i)))
 
 
 def build_shared_metadata(
@@ -167,16 +167,7 @@ def _read_shared_file(task: CompletionTask) -> None:
         raise FileExistsError(
             f"out: {folder} holds other files, expected an empty folder, or one that this command wrote"
         )
-    try:
-        existing = storage.parse_strict_json(shared_file.read_text(encoding="utf-8"))
-        is_same = existing["key"] == task.shared["key"]
-        difference = "" if is_same else result_files.describe_difference(existing, task.shared)
-    except (ValueError, KeyError, TypeError) as error:
-        raise FileExistsError(f"{shared_file}: found {error}, expected a file written by dhtorch complete") from None
-    if not is_same:
-        raise FileExistsError(
-            f"{shared_file}: found frames of another run ({difference}), expected the same settings or another out=DIR"
-        )
+    result_files.check_same_run(shared_file, task.shared, "frames")
 
 
 def _adopt_older_version(task: CompletionTask, folder: OutputFolder) -> None:
@@ -206,7 +197,7 @@ def read_complete_frames(task: CompletionTask) -> dict[str, Row]:
 
 def _read_meta(task: CompletionTask, path: Path) -> Row | None:
     """The meta row of a frame, None where a file is missing, invalid or of another key."""
-    if any(not task.layout.file(task.folder, kind, path.stem).is_file() for kind in task.layout.folders):
+    if not all(is_whole(task.layout.file(task.folder, kind, path.stem)) for kind in task.layout.folders):
         return None
     try:
         row: Row = storage.parse_strict_json(path.read_text(encoding="utf-8"))

@@ -24,7 +24,7 @@ from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
 from dhtorch.extract.enriched import MAP_FILES, NO_ANSWER_REASONS, DatasetCamera, MapRowDataset, camera_key, map_columns
 from dhtorch.extract.nerf_target import NerfstudioTarget
-from dhtorch.extract.origin import DEFAULT_FPS, DatasetSource, LeRobotSource, frame_rate, has_frame_rate
+from dhtorch.extract.origin import DEFAULT_FPS, METADATA_FILE, DatasetSource, LeRobotSource, frame_rate, has_frame_rate
 from dhtorch.extract.policy_columns import POLICY_COLUMNS
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.step_set import RldsSource
@@ -50,9 +50,6 @@ _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1
 #: Options that determine what is written; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma",
          "columns", "max_frames", "every", "maps", "step", "fps", "task", "on_error", "sensor")  # fmt: skip
-
-#: File of the shared metadata.
-_METADATA_FILE = "dhtorch.json"
 
 #: Longer side of a depth map with dense=false (samples only), px.
 _SAMPLED_MAP_SIDE_PX = 640
@@ -382,14 +379,9 @@ def _prepare_folder(work: EnrichJob, folder: OutputFolder, missing: Sequence[int
         FileExistsError: it holds other files, or was written from other data or with other options, or a link or a
             foreign file is in the way.
     """
-    metadata_file = work.out / "meta" / _METADATA_FILE
+    metadata_file = work.out / "meta" / METADATA_FILE
     if metadata_file.is_file():
-        existing = storage.parse_strict_json(metadata_file.read_text(encoding="utf-8"))
-        if existing["key"] != work.shared["key"]:
-            difference = result_files.describe_difference(existing, work.shared)
-            raise FileExistsError(
-                f"{work.out}: found the data set of another run ({difference}), expected the same settings or out=DIR"
-            )
+        result_files.check_same_run(metadata_file, work.shared, "the data set")
         if folder.is_unlisted:  # of an older version
             folder.adopt(work.out.rglob("*"))
     elif storage.has_files(work.out):

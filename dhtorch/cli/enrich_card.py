@@ -17,8 +17,9 @@ from dhtorch.cli.enrich_page import summarise_cameras
 from dhtorch.codes import Source, names
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import import_optional
+from dhtorch.extract.origin import SOURCE_CARD
 from dhtorch.extract.policy_columns import N_POINTS
-from dhtorch.extract.robot_target import SOURCE_CARD, LeRobotTarget
+from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 

@@ -15,6 +15,7 @@ from dhtorch.experiments.report.figure import Figure
 from dhtorch.experiments.report.page import PAGE_CSS, figures_markup, table_markup
 from dhtorch.experiments.report.tables import ReportTable
 from dhtorch.extract.enriched import NO_ANSWER_REASONS, NO_OTHER_VIEW
+from dhtorch.extract.origin import REPORT_FILES
 from dhtorch.extract.targets import UNKNOWN_CONVENTION
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
@@ -24,9 +25,6 @@ from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import make_tag
 
 Row = Mapping[str, Any]
-
-#: Stem of the page and of the JSON file with its numbers.
-_REPORT_NAME = "report"
 
 #: Episodes listed, those with least depth first.
 _MAX_LISTED_EPISODES = 10
@@ -71,7 +69,8 @@ def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
 
 def page_files(folder: Path) -> tuple[Path, Path]:
     """The files that :func:`write_enrich_page` writes: numbers and page."""
-    return folder / f"{_REPORT_NAME}.json", folder / f"{_REPORT_NAME}.html"
+    numbers, page = REPORT_FILES
+    return folder / numbers, folder / page
 
 
 def write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:

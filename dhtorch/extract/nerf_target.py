@@ -19,6 +19,7 @@ from dhtorch.extract.instants import iter_rows
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.geometry import camera as cameras
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import is_whole
 
 #: File of the points, as nerfstudio names its own.
 _POINTS_FILE = "sparse_pc.ply"
@@ -53,14 +54,15 @@ class NerfstudioTarget:
 
     def own(self, k: int) -> Row | None:
         """As :meth:`DatasetTarget.own`."""
+        files = [self._file(k, key) for key in self.views]
         try:
-            summaries = [
-                storage.parse_strict_json(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"]
-                for key in self.views
-            ]
+            contents = [storage.parse_strict_json(file.read_text(encoding="utf-8")) for file in files]
+            summaries = [content["dhtorch"] for content in contents]
         except (OSError, ValueError, KeyError):
             return None
         if any(summary["key"] != self.key for summary in summaries):
+            return None
+        if not all(map(_has_all_files, files, contents)):
             return None
         return {**summaries[0], "cameras": {name: x for summary in summaries for name, x in summary["cameras"].items()}}
 
@@ -91,6 +93,12 @@ class NerfstudioTarget:
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`: nothing to write, the folders are independent."""
+
+
+def _has_all_files(file: Path, content: Row) -> bool:
+    """Whether the pictures and points that a ``transforms.json`` of this writer names are there, with all bytes."""
+    names = [name for shot in content["frames"] for key, name in shot.items() if key.endswith("file_path")]
+    return all(is_whole(file.parent / name) for name in (content["ply_file_path"], *names))
 
 
 class _PointCloud:

@@ -22,8 +22,18 @@ TABLE_GROUP_ROWS = 8
 #: Frames per second if a recording has neither a rate nor time stamps.
 DEFAULT_FPS = 30.0
 
-#: Files of ``meta/`` that are rewritten instead of copied.
+#: Data set card of the source beside that of the enriched set.
+SOURCE_CARD = "README.source.md"
+
+#: Files of ``meta/`` that state which run wrote an enriched set, and with which result: those of a source that is one
+#: itself are not copied.
+METADATA_FILE, REPORT_FILES = "dhtorch.json", ("report.json", "report.html")
+
+#: Files that are rewritten or belong to the source's own run, and are not copied.
 _REWRITTEN_META_FILES = (
+    METADATA_FILE,
+    *REPORT_FILES,
+    SOURCE_CARD,
     "info.json",
     "stats.json",
     "tasks.parquet",
@@ -73,6 +83,10 @@ class DatasetSource(Protocol):
     @property
     def stats(self) -> dict[str, Any]:
         """Statistics by feature, as in ``meta/stats.json``; empty if it has none."""
+
+    @property
+    def intrinsics(self) -> dict[str, Any]:
+        """Entries by camera, as in ``meta/intrinsics.json``; empty if it has none."""
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """Rows of episode ``i`` in order, as Arrow tables of few rows; new task texts are appended to ``tasks``."""
@@ -129,7 +143,16 @@ class LeRobotSource:
     @property
     def stats(self) -> dict[str, Any]:
         """Statistics in ``meta/stats.json``, where it is."""
-        file = self.meta.root / "meta" / "stats.json"
+        return self._read_meta_file("stats.json")
+
+    @property
+    def intrinsics(self) -> dict[str, Any]:
+        """Entries in ``meta/intrinsics.json``, where it is."""
+        return self._read_meta_file("intrinsics.json")
+
+    def _read_meta_file(self, name: str) -> dict[str, Any]:
+        """Object in a JSON file of ``meta/``; empty if there is none."""
+        file = self.meta.root / "meta" / name
         content = files.read_json(file) if file.is_file() and self._is_inside(file) else {}
         return content if isinstance(content, dict) else {}
 

@@ -114,19 +114,19 @@ def sample_cloud(depth: np.ndarray, K: Sequence[float], view: DatasetCamera) -> 
     return points.float().numpy()
 
 
-def make_modality(root: Path, features: Mapping[str, FeatureSpec], videos: Mapping[str, str]) -> dict[str, Any]:
+def make_modality(root: Path | None, features: Mapping[str, FeatureSpec], videos: Mapping[str, str]) -> dict[str, Any]:
     """Contents of GR00T's ``modality.json``: the source's with further videos, or of the features where it has none.
 
     Args:
-        root: of the new data set, with the copy of the source's file.
+        root: of the source; None = it has no such file.
         features: of the new data set.
         videos: name → video feature, to be added.
 
     Raises:
         FormatError: a file that is not an object of objects.
     """
-    path = root / MODALITY_FILE
-    modality = files.read_json(path) if path.is_file() else _default_modality(features)
+    path = Path(MODALITY_FILE) if root is None else root / MODALITY_FILE
+    modality = _default_modality(features) if root is None else files.read_json(path)
     if not isinstance(modality, dict) or not isinstance(modality.get("video", {}), dict):
         raise FormatError(path, "video", "no object", "names of videos, each with original_key")
     added = {name: {"original_key": key} for name, key in videos.items()}

@@ -29,20 +29,17 @@ from dhtorch.extract.enriched import (
     number_column,
 )
 from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
-from dhtorch.extract.origin import DatasetSource, LeRobotSource
+from dhtorch.extract.origin import SOURCE_CARD, DatasetSource, LeRobotSource
 from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import is_whole
 
 #: Key of the metadata with the summary of an episode.
 _EPISODE_METADATA_KEY = b"dhtorch.episode"
 
 #: Task text of recordings without one.
 _DEFAULT_TASK = "look around"
-
-
-#: Name of the source's data set card beside that of the enriched set.
-SOURCE_CARD = "README.source.md"
 
 
 class LeRobotTarget:
@@ -195,7 +192,7 @@ class LeRobotTarget:
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
         except (OSError, ValueError, KeyError):
             return None
-        return summary if summary["key"] == self.key else None
+        return summary if summary["key"] == self.key and all(map(is_whole, self._geometry_files(k))) else None
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`DatasetTarget.assemble`."""
@@ -344,7 +341,10 @@ class LeRobotTarget:
         return cells
 
     def _renumber(self, table: Any, k: int, start: int) -> Any:
-        """Number episodes from 0 and rows consecutively; changed numbers of the source are kept under ``source.``."""
+        """Number episodes from 0 and rows consecutively; changed numbers of the source are kept under ``source.``.
+
+        The prefix is repeated where the source has such columns of its own source.
+        """
         pyarrow = import_optional("pyarrow")
         n = table.num_rows
         numbers = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
@@ -355,7 +355,10 @@ class LeRobotTarget:
             elif self.renumbered or self.version == 3:
                 position = table.column_names.index(name)
                 if self.renumbered:
-                    table = table.append_column(f"source.{name}", table.column(name))
+                    kept = f"source.{name}"
+                    while kept in table.column_names:
+                        kept = f"source.{kept}"
+                    table = table.append_column(kept, table.column(name))
                 table = table.set_column(position, name, array)
         return table
 
@@ -416,8 +419,14 @@ class LeRobotTarget:
         kind = "geometry_image"
         return {f"{view.name}_{kind}": self.keys[key][kind] for key, view in self.views.items() if kind in self.maps}
 
+    def _geometry_files(self, k: int) -> list[Path]:
+        """Videos of geometry images of the ``k``-th episode."""
+        clip = self._new_clip(k, 0)
+        keys = self._geometry_videos().values()
+        return [self.root / lerobot.episode_video_path(self.version, key, clip, k) for key in keys]
+
     def _copy_videos(self, k: int, length: int) -> None:
-        """Copy the videos of an episode unchanged."""
+        """Copy the videos of an episode unchanged, except those that are there with all bytes."""
         for key, (file, clip) in self._clips(k, length).items():
             storage.copy_file(file, self.root / lerobot.episode_video_path(self.version, key, clip, k))
 
@@ -436,11 +445,7 @@ class LeRobotTarget:
     def planned_files(self, missing: Sequence[int]) -> list[Path]:
         """As :meth:`DatasetTarget.planned_files`."""
         names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "source_features.json", "intrinsics.json")
-        videos = [
-            self.root / lerobot.episode_video_path(self.version, key, self._new_clip(k, 0), k)
-            for key in self._geometry_videos().values()
-            for k in missing
-        ]
+        videos = [file for k in missing for file in self._geometry_files(k)]
         files = [*(self.file(k) for k in missing), *videos, *(self.root / "meta" / name for name in names)]
         return [*files, self.root / policy_columns.MODALITY_FILE] if videos else files
 
@@ -454,10 +459,14 @@ class LeRobotTarget:
             unlisted = {key: self.source_features[key] for key in self.unlisted}
             storage.write_json(self.root / "meta" / "source_features.json", unlisted)
         tasks = self._tasks(owns)
+        for k, summary in enumerate(owns):
+            self._copy_videos(k, summary["length"])  # those of episodes that were complete before
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / (SOURCE_CARD if name == "README.md" else name))
         if videos := self._geometry_videos():
-            modality = policy_columns.make_modality(self.root, features, videos)
+            has_modality = self.origin is not None and policy_columns.MODALITY_FILE in self.origin.more
+            source = self.origin.root if self.origin is not None and has_modality else None
+            modality = policy_columns.make_modality(source, features, videos)
             storage.write_json(self.root / policy_columns.MODALITY_FILE, modality)
         episodes = [
             lerobot.EpisodeSpec(
@@ -570,10 +579,13 @@ class LeRobotTarget:
             storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
 
     def _write_lenses(self) -> None:
-        """Write distortion coefficients, which the format cannot hold, to the side-car file ``intrinsics.json``."""
-        distortions = {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
-        if distortions:
-            storage.write_json(self.root / "meta" / "intrinsics.json", distortions)
+        """Write distortion coefficients, which the format cannot hold, to the side-car file ``intrinsics.json``, with
+        the source's entries of other cameras."""
+        others = {} if self.origin is None else self.origin.intrinsics
+        entries = {key: entry for key, entry in others.items() if key not in self.views}
+        entries |= {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
+        if entries:
+            storage.write_json(self.root / "meta" / "intrinsics.json", entries)
 
 
 def _number_feature(column: Column) -> FeatureSpec:

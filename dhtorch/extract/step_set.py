@@ -79,6 +79,11 @@ class RldsSource:
         return {}
 
     @property
+    def intrinsics(self) -> dict[str, Any]:
+        """None: the format has no such file."""
+        return {}
+
+    @property
     def more(self) -> dict[str, Path]:
         """None: its other files describe the TFRecord files."""
         return {}

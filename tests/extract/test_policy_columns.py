@@ -185,7 +185,7 @@ def test_a_groot_file_that_is_no_object_is_refused(tmp_path):
 def test_a_set_without_a_groot_file_gets_one_of_its_features(tmp_path):
     numbers = {"dtype": "float32", "shape": [8]}
     features = {"observation.state": numbers, "action": numbers, CAMERA: {"dtype": "video", "shape": [*HW, 3]}}
-    modality = make_modality(tmp_path, features, {"front_geometry_image": PICTURE})
+    modality = make_modality(None, features, {"front_geometry_image": PICTURE})
     assert modality["state"] == {"state": {"start": 0, "end": 8}} and modality["action"]["action"]["end"] == 8
     assert modality["video"] == {
         "front": {"original_key": CAMERA},

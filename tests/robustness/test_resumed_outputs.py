@@ -1,0 +1,221 @@
+"""Outputs that are incomplete, damaged, foreign or of an earlier run: what the next run of a command makes of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+
+from pyarrow import parquet
+from support.dataset_folders import read_files, read_rows
+from support.known_episodes import CAMERAS, LENS, episodes, pose, write_robot
+
+from dhtorch import testing as writers
+from dhtorch.cli import run
+from dhtorch.extract.enriched import MapRowDataset
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER
+
+FRONT, WRIST = (f"observation.images.{name}" for name in CAMERAS)
+FEW = ["method=paper", "method.n=64", "method.hypotheses=10"]
+ENRICH = [*FEW, "gap=0", "dense=false", "max_frames=2", "workers=0"]
+COMPLETE = [*FEW, "planes=8", "refinements=1", "steps=[1]", "max_frames=2"]
+
+Words = Sequence[str]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The known set, with a card and a report page that are not dhtorch's."""
+    root = tmp_path_factory.mktemp("robot") / "set"
+    write_robot(root)
+    (root / "README.md").write_text("---\nlicense: mit\n---\n# Of the robot\n")
+    (root / "meta" / "report.html").write_text("foreign")
+    return root
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames of one camera, time-stamped."""
+    root = tmp_path_factory.mktemp("captures") / "room"
+    writers.write_tum(root, episodes(0)[0][:2])
+    return root
+
+
+def enrich(source: Path, out: Path, *more: str) -> int:
+    return run.main(["enrich", str(source), str(out), *ENRICH, *more])
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    lines = [line for line in capsys.readouterr().err.splitlines() if "depth unit assumed" not in line]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+# ------------------------------------------------------------------------------------------------- an enriched set again
+
+
+@pytest.fixture(scope="module")
+def once(robot: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The set with depth for its first camera, and the report of that run."""
+    out = tmp_path_factory.mktemp("once") / "set"
+    assert enrich(robot, out, "data=lerobot", f"data.camera={FRONT}", "dense={size: 64, planes: 8}") == 0
+    return out
+
+
+def test_an_enriched_set_that_is_enriched_again_has_its_own_records_and_can_be_resumed(
+    robot: Path, once: Path, tmp_path: Path
+) -> None:
+    twice = tmp_path / "twice"
+    words = ["data=lerobot", f"data.camera={WRIST}", "report=false"]
+    assert enrich(once, twice, *words) == 0
+    keys = [json.loads((root / "meta" / "dhtorch.json").read_text())["key"] for root in (once, twice)]
+    assert keys[0] != keys[1]
+    summaries = []
+    for root in (once, twice):
+        table = next((root / "data").rglob("*.parquet"))
+        summaries.append(json.loads(parquet.read_metadata(table).metadata[b"dhtorch.episode"]))
+    assert [summary["key"] for summary in summaries] == keys
+    assert [list(summary["cameras"]) for summary in summaries] == [["front"], ["wrist"]]
+    assert not list((twice / "meta").glob("report.*")) and (once / "meta" / "report.json").is_file()
+    assert (twice / "README.source.md").read_bytes() == (once / "README.md").read_bytes()
+    assert "license: mit\n" in (twice / "README.md").read_text()
+    assert json.loads((twice / "meta" / "intrinsics.json").read_text()) == {WRIST: {"dist": pytest.approx(LENS)}}
+    before, after = read_rows(once), read_rows(twice)
+    assert len(before) == len(after) == 4
+    for row, same in zip(before, after, strict=True):
+        assert {name: same[name] for name in row} == row, "what the first run wrote is there"
+        assert f"{WRIST}_depth_enriched" in same
+    whole = read_files(twice)
+    (twice / "data" / "chunk-000" / "file-001.parquet").unlink()
+    assert enrich(once, twice, *words) == 0
+    assert read_files(twice) == whole, "resumed"
+
+
+def test_the_lens_of_a_camera_that_is_not_enriched_is_kept(once: Path) -> None:
+    assert json.loads((once / "meta" / "intrinsics.json").read_text()) == {WRIST: {"dist": pytest.approx(LENS)}}
+
+
+def test_without_a_report_there_is_no_report_of_another(robot: Path, tmp_path: Path) -> None:
+    assert enrich(robot, tmp_path / "set", "data=lerobot", f"data.camera={FRONT}", "report=false") == 0
+    assert (
+        not list((tmp_path / "set" / "meta").glob("report*"))
+        and "foreign" in read_files(robot)["meta/report.html"].decode()
+    )
+
+
+# ------------------------------------------------------------------------------------------------------ damaged outputs
+
+
+def _lerobot(robot: Path, _capture: Path) -> Words:
+    return ["enrich", str(robot), "OUT", *ENRICH, "columns=[depth,sigma,source,geometry_image]"]
+
+
+def _nerfstudio(_robot: Path, capture: Path) -> Words:
+    return ["enrich", str(capture), "OUT", *ENRICH, "format=nerfstudio"]
+
+
+def _extract(robot: Path, _capture: Path) -> Words:
+    words = [f"data.root={robot}", "data=lerobot", f"data.camera={FRONT}", "extract.gap=1", "extract.shard_rows=4"]
+    return ["extract", *words, "extract.columns=[depth]", "out=OUT", *FEW]
+
+
+def _complete(_robot: Path, capture: Path) -> Words:
+    return ["complete", str(capture), "out=OUT", *COMPLETE, "figures=all", "points=true", "arrays=true"]
+
+
+#: Command → its words, and the file that states which run wrote the folder.
+WRITERS: dict[str, tuple[Callable[[Path, Path], Words], str | None]] = {
+    "enrich": (_lerobot, "meta/dhtorch.json"),
+    "enrich, nerfstudio": (_nerfstudio, "meta/dhtorch.json"),
+    "complete": (_complete, "complete.json"),
+    "extract": (_extract, None),
+}
+
+
+def run_into(words: Words, out: Path) -> int:
+    return run.main([word.replace("OUT", str(out)) for word in words])
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_empty_or_shortened_output_counts_as_missing(
+    command: str, robot: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make, records = WRITERS[command]
+    words, out = make(robot, capture), tmp_path / "out"
+    assert run_into(words, out) == 0
+    whole = read_files(out)
+    names = sorted(whole.keys() - {records})
+    assert len(names) >= 3
+    for k, name in enumerate(names):  # the head of a short file says too little of whose it is
+        (out / name).write_bytes(whole[name][:-1] if k % 2 and len(whole[name]) > 64 else b"")
+    assert run_into(words, out) == 0
+    after = read_files(out)
+    assert after.keys() == whole.keys()
+    assert not [name for name in names if after[name] != whole[name] and not name.startswith("figures/")]
+    capsys.readouterr()
+    for content in (b"", b"null") if records else ():
+        (out / records).write_bytes(content)
+        assert run_into(words, out) == run.EXIT_FAILED
+        assert str(out / records) in one_line(capsys)
+        assert {name: x for name, x in read_files(out).items() if name != records} == {
+            name: x for name, x in after.items() if name != records
+        }
+
+
+def test_unfinished_files_of_a_dead_run_are_removed(robot: Path, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    words = [*_lerobot(robot, robot)]
+    assert run_into(words, out) == 0
+    whole = read_files(out)
+    for name in (f"{PRIVATE_FOLDER}/unfinished/3.mp4", f"{PRIVATE_FOLDER}/shards/.shard-00001.parquet.x7.tmp"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_bytes(b"half")
+    assert run_into(words, out) == 0
+    assert read_files(out) == whole
+    assert [p.name for p in (out / PRIVATE_FOLDER).rglob("*")] == ["manifest"]
+
+
+# ----------------------------------------------------------------------------------------------------------- long names
+
+
+def test_a_camera_whose_video_would_have_too_long_a_name_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = "observation.images." + 231 * "c"
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [episodes(0)[0][:2]], camera=camera, depth="tiff", image="image")
+    rows: list[int] = []
+    real = MapRowDataset.features
+    monkeypatch.setattr(MapRowDataset, "features", lambda self, opened, i: rows.append(i) or real(self, opened, i))
+    more = ["columns=[depth,sigma,source,geometry_image]"]
+    assert enrich(source, tmp_path / "out", *more) == run.EXIT_FAILED
+    assert "File name too long (265 bytes, at most 255)" in one_line(capsys) and not rows
+    assert not (tmp_path / "out").exists()
+    assert enrich(source, tmp_path / "out", "report=false") == 0 and rows, "without the video it is no name of a file"
+
+
+def test_a_capture_of_a_long_name_runs_as_any_other(capture: Path, tmp_path: Path) -> None:
+    long = tmp_path / (250 * "n")
+    shutil.copytree(capture, long)
+    out = tmp_path / "out"
+    words = ["data=auto", f"data.root={long}", "pairs.gap=1", "method=paper", "method.n=64", "figures=false"]
+    assert run.main(["run", *words, f"output={out}"]) == 0
+    assert json.loads((out / "result.json").read_text())["data"]["scenes"] == [250 * "n"]
+
+
+def test_the_known_frames_differ_in_every_number() -> None:
+    frames = [frame for camera in (0, 1) for episode in episodes(camera) for frame in episode]
+    for name in ("image", "depth", "time"):
+        values = [getattr(frame, name).flatten() for frame in frames]
+        assert all(not torch.equal(a, b) for k, a in enumerate(values) for b in values[:k]), name
+    poses = [pose(camera, e, i) for camera in (0, 1) for e in (0, 1) for i in range(9)]
+    assert len({tuple(np.ravel(T)) for T in poses}) == len(poses)
