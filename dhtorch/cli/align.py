@@ -167,7 +167,7 @@ def _make_alignment_task(
     )
 
 
-def _list_data_files(scene: Scene, maps: DepthMaps, frames: Sequence[int]) -> dict[str, Path]:
+def _list_data_files(scene: Scene, maps: DepthMaps, frames: Sequence[int]) -> dict[str, Path | str]:
     """Name -> path of all input files: the scene's and the maps'."""
     maps_by_name = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
     root = scene.root

@@ -124,12 +124,13 @@ def build_shared_metadata(
 
 def digest_scene_files(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
     """Digest of all data files outside the output folder."""
-    files = {
+    files: dict[str, Path | str] = {
         **result_files.list_files_below([scene.root]),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
     output = out.resolve()
-    return result_files.compute_data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(output)})
+    outside = {k: p for k, p in files.items() if isinstance(p, str) or not p.resolve().is_relative_to(output)}
+    return result_files.compute_data_digest(outside)
 
 
 @contextlib.contextmanager
@@ -167,7 +168,7 @@ def _read_shared_file(task: CompletionTask) -> None:
         raise FileExistsError(
             f"out: {folder} holds other files, expected an empty folder, or one that this command wrote"
         )
-    result_files.check_same_run(shared_file, task.shared, "frames")
+    result_files.check_same_run(shared_file, task.shared, "complete")
 
 
 def _adopt_older_version(task: CompletionTask, folder: OutputFolder) -> None:

@@ -339,7 +339,7 @@ def _build_metadata(
 ) -> Row:
     """Metadata shared by all files of the data set, with their key."""
     config = {k: settings[k] for k in _KEY_OPTIONS}
-    files = {
+    files: dict[str, Path | str] = {
         **result_files.list_files_below(whole.roots),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
@@ -381,7 +381,7 @@ def _prepare_folder(work: EnrichJob, folder: OutputFolder, missing: Sequence[int
     """
     metadata_file = work.out / "meta" / METADATA_FILE
     if metadata_file.is_file():
-        result_files.check_same_run(metadata_file, work.shared, "the data set")
+        result_files.check_same_run(metadata_file, work.shared, "enrich")
         if folder.is_unlisted:  # of an older version
             folder.adopt(work.out.rglob("*"))
     elif storage.has_files(work.out):
@@ -419,7 +419,8 @@ def _camera_key(work: EnrichJob, n: int) -> str:
 
 def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
-    size = sum(path.stat().st_size for path in result_files.list_files_below([work.out]).values())
+    files = result_files.list_files_below([work.out]).values()
+    size = sum(path.stat().st_size for path in files if isinstance(path, Path))
     frames = sum(own["length"] for own in owns)
     kept = f" ({n_untouched} left untouched)" if n_untouched else ""
     lines = [

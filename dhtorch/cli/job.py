@@ -228,7 +228,7 @@ def _resolve_data(data: Any) -> Sequence[Scene] | Sequence[FocalStacks]:
     return scenes_of(data)
 
 
-def _list_data_files(data_sets: Iterable[Scene | FocalStacks]) -> dict[str, Path]:
+def _list_data_files(data_sets: Iterable[Scene | FocalStacks]) -> dict[str, Path | str]:
     """Name → path of all data files below the scenes' folders."""
     return result_files.list_files_below(each.root for each in data_sets)
 

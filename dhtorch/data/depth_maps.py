@@ -9,13 +9,11 @@ says. Output of ``dhtorch complete`` is read directly: the unit comes from its `
 
 from __future__ import annotations
 
-import io
 import re
 import warnings
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,11 +23,12 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.codecs.exr import read_exr
-from dhtorch.data.codecs.npy import read_npz, read_real_npy
+from dhtorch.data.codecs.npy import list_npz_members, read_npz, read_real_npy
 from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.codecs.tiff import read_tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError
+from dhtorch.data.io.safe_open import check_link, modification_time_ns, restrict_links
 from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import check_orientation
@@ -70,6 +69,7 @@ class DepthMaps:
     clip_index: Sequence[int] = ()  # of every frame's map in a file of a whole clip; empty = one file per map
     warnings: Sequence[str] = ()  # on how files were matched
     left_out: Sequence[str] = ()  # remarks on files that are no maps
+    bounds: Path | None = None  # symbolic links must not point outside it; None = no restriction
 
     @property
     def frames(self) -> list[int]:
@@ -114,7 +114,8 @@ class DepthMaps:
         file = self.files[i]
         if file is None:
             return None
-        array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
+        with restrict_links(self.bounds):
+            array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
         _check_shape(file, array.shape, self.hw)
         stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
         depth = clear_no_depth(stored * self.unit.metres, self.unit.metres)
@@ -129,7 +130,8 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
     A file belongs to the frame whose number is in its name, the last one by which all names differ: every frame must
     have a file, or every file a frame. Where no file has a frame's number, and there are as many files as frames, they
     are matched in order, sorted by the numbers in their names. A single file with N maps needs N frames, or frames that
-    are all numbered below N. Masks (``*_mask.npy``) are left out.
+    are all numbered below N. Masks (``*_mask.npy``) are left out. Links may lead out of the folder only where those of
+    the recording may.
 
     Args:
         folder: of the files, or the output folder of ``dhtorch complete``.
@@ -138,17 +140,27 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
             for all others, which is reported as an assumption.
 
     Raises:
-        FormatError: no folder, no map, maps of several formats, two of one number, or files that cannot be matched.
+        FormatError: no folder, no map, maps of several formats, two of one number, files that cannot be matched, or a
+            link that leads out of the folder.
         ValueError: an unknown unit.
     """
     root = Path(folder).expanduser()
     if not root.is_dir():
         raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
+    bounds = None if recording.root is not None and recording.bounds is None else root
+    with restrict_links(bounds):
+        return replace(_open_folder(root, recording, unit), bounds=bounds)
+
+
+def _open_folder(root: Path, recording: Recording, unit: str | float | None) -> DepthMaps:
+    """As :func:`open_depth_maps`, of an existing folder."""
     metadata_file = root / "complete.json"
     if unit is None and root.name == "depth" and (root.parent / "complete.json").is_file():
         raise FormatError(root, "depth", "a part of a folder of dhtorch complete", f"{root.parent}, or depth_unit")
     depth_folder = root / "depth" if (root / "depth").is_dir() else root
     candidates = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    for file in candidates:
+        check_link(file)
     masks = [file for file in candidates if _MASK_PATTERN.search(file.stem)]
     map_files = [file for file in candidates if file not in masks]
     kinds = Counter(file.suffix.lower() for file in map_files)
@@ -267,11 +279,7 @@ def _read_npy(file: Path) -> np.ndarray:
 
 def _read_npz_depth(file: Path) -> np.ndarray:
     """NPZ file → its only array, or the one named depth."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(files.read_bytes(file))) as archive:
-            keys = [name.removesuffix(".npy") for name in archive.namelist()]
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
-        raise FormatError(file, "archive", f"{type(error).__name__}", "a whole .npz archive") from None
+    keys = [name.removesuffix(".npy") for name in list_npz_members(file)]
     named = [key for key in _NPZ_KEYS if key in keys]
     return read_npz(file, keys[0] if len(keys) == 1 else named[0] if named else _NPZ_KEYS[0])
 
@@ -286,7 +294,7 @@ def _read_map(file: Path) -> np.ndarray:
 
 def _open_clip(file: Path) -> np.ndarray:
     """NPY or NPZ file → its maps (N, h, w); N = 1 where it holds one map, or none. The last file stays in memory."""
-    return _read_clip(file, file.stat().st_mtime_ns)
+    return _read_clip(file, modification_time_ns(file))
 
 
 @lru_cache(maxsize=1)
@@ -295,6 +303,8 @@ def _read_clip(file: Path, time_ns: int) -> np.ndarray:
     for axis in (-1, 1):
         if array.ndim == 4 and array.shape[axis] == 1:
             array = array.squeeze(axis)
+    if array.size == 0:
+        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width) or (maps, height, width)")
     is_one = array.ndim != 3 or 1 in (array.shape[0], array.shape[-1])
     return array[None] if is_one else array
 

@@ -56,11 +56,13 @@ class NerfstudioTarget:
         """As :meth:`DatasetTarget.own`."""
         files = [self._file(k, key) for key in self.views]
         try:
-            contents = [storage.parse_strict_json(file.read_text(encoding="utf-8")) for file in files]
-            summaries = [content["dhtorch"] for content in contents]
-        except (OSError, ValueError, KeyError):
-            return None
-        if any(summary["key"] != self.key for summary in summaries):
+            summaries = [
+                storage.parse_strict_json(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"]
+                for key in self.views
+            ]
+            if any(summary["key"] != self.key for summary in summaries):
+                return None
+        except (OSError, ValueError, KeyError, TypeError):
             return None
         if not all(map(_has_all_files, files, contents)):
             return None

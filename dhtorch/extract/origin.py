@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError, import_optional
@@ -22,14 +23,10 @@ TABLE_GROUP_ROWS = 8
 #: Frames per second if a recording has neither a rate nor time stamps.
 DEFAULT_FPS = 30.0
 
-#: Data set card of the source beside that of the enriched set.
-SOURCE_CARD = "README.source.md"
+#: Largest number of tasks of a data set. Source: derived, more than the episodes of any published set.
+_MAX_TASKS = 10**6
 
-#: Files of ``meta/`` that state which run wrote an enriched set, and with which result: those of a source that is one
-#: itself are not copied.
-METADATA_FILE, REPORT_FILES = "dhtorch.json", ("report.json", "report.html")
-
-#: Files that are rewritten or belong to the source's own run, and are not copied.
+#: Files of ``meta/`` that are rewritten instead of copied.
 _REWRITTEN_META_FILES = (
     METADATA_FILE,
     *REPORT_FILES,
@@ -121,9 +118,10 @@ class LeRobotSource:
         Raises:
             FormatError: damaged metadata.
         """
-        meta = read_lerobot_meta(root)
-        info = files.read_json(root / "meta" / "info.json")
-        return cls(meta, info, read_lerobot_episodes(meta, numbers), tuple(_read_tasks(meta)), limit, bounds)
+        with doors.restrict_links(bounds):
+            meta = read_lerobot_meta(root)
+            info = files.read_json(root / "meta" / "info.json")
+            return cls(meta, info, read_lerobot_episodes(meta, numbers), tuple(_read_tasks(meta)), limit, bounds)
 
     @property
     def version(self) -> int:
@@ -208,9 +206,25 @@ class LeRobotSource:
         return self.bounds is None or doors.is_inside(path, self.bounds)
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
-        """As :meth:`DatasetSource.batches`; missing ``frame_index`` and ``task_index`` are added."""
+        """As :meth:`DatasetSource.batches`; missing ``frame_index`` and ``task_index`` are added.
+
+        Raises:
+            FormatError: a damaged table, a link that leads out of the data set, or a ``task_index`` that is no count.
+        """
+        pyarrow, file = import_optional("pyarrow"), self.episodes[i].data
+        try:
+            for part in self._scan(i):
+                _check_task_index(part, file)
+                yield part
+        except (pyarrow.ArrowException, OSError) as error:
+            raise FormatError(file, "rows", error, "decodable columns") from None
+
+    def _scan(self, i: int) -> Iterator[Any]:
+        """Rows of episode ``i`` with ``frame_index`` and ``task_index``."""
         pyarrow, dataset = import_optional("pyarrow"), import_optional("pyarrow.dataset")
         episode = self.episodes[i]
+        with doors.restrict_links(self.bounds):
+            read_parquet_header(episode.data)
         table = dataset.dataset(str(episode.data), format="parquet")
         has_episodes = "episode_index" in table.schema.names
         rows = dataset.field("episode_index") == episode.number if has_episodes else None
@@ -230,7 +244,8 @@ class LeRobotSource:
     def words(self, i: int) -> list[str] | None:
         """Task texts of episode ``i`` in ``meta/``; None = none."""
         number = int(self.episodes.numbers[i])
-        return _read_episode_tasks(self.meta).get(number)
+        with doors.restrict_links(self.bounds):
+            return _read_episode_tasks(self.meta).get(number)
 
     @property
     def more(self) -> dict[str, Path]:
@@ -253,6 +268,14 @@ def _with_frame_index(part: Any, done: int, first: float) -> Any:
     return part.set_column(place, "timestamp", pyarrow.array((stamp - first).astype(stamp.dtype)))
 
 
+def _check_task_index(part: Any, file: Path) -> None:
+    """Raise FormatError for rows of the table ``file`` whose ``task_index`` is no whole number below the limit."""
+    for value in part.column("task_index").to_pylist():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (is_number and 0 <= value < _MAX_TASKS and value == int(value)):
+            raise FormatError(file, "task_index", value, f"a whole number from 0 to {_MAX_TASKS - 1}")
+
+
 def _with_task_index(part: Any) -> Any:
     """Add ``task_index`` 0 to rows without one."""
     pyarrow = import_optional("pyarrow")
@@ -271,14 +294,15 @@ def _read_tasks(meta: LeRobotMeta) -> list[str]:
             if row is not None:
                 tasks[files.get_entry(row, "task_index", int, lines)] = files.get_entry(row, "task", str, lines)
     elif table.is_file():
-        content = import_optional("pyarrow.parquet").read_table(table)
-        names = [name for name in content.column_names if name != "task_index"]
-        if "task_index" not in content.column_names or not names:
-            raise FormatError(table, "columns", ", ".join(content.column_names), "task_index and task")
-        texts = content.column("task" if "task" in names else names[-1]).to_pylist()
-        tasks = dict(zip(content.column("task_index").to_pylist(), map(str, texts), strict=True))
-    if any(k is None or not 0 <= k < 10**6 for k in tasks):
-        raise FormatError(lines if lines.is_file() else table, "task_index", sorted(tasks, key=str)[0], "a count")
+        names = [name for name in read_parquet_header(table).columns if name != "task_index"]
+        name = "task" if "task" in names else names[-1] if names else "task"
+        content = read_columns(table, ["task_index", name])
+        numbers = np.asarray(content["task_index"])
+        if numbers.dtype.kind not in "iu":
+            raise FormatError(table, "task_index", f"{numbers.dtype} {numbers[:1].tolist()}", "whole numbers")
+        tasks = dict(zip(numbers.tolist(), map(str, content[name]), strict=True))
+    if any(not 0 <= k < _MAX_TASKS for k in tasks):
+        raise FormatError(lines if lines.is_file() else table, "task_index", min(tasks), f"0 to {_MAX_TASKS - 1}")
     return [tasks.get(k, "") for k in range(max(tasks, default=0) + 1)]
 
 
@@ -288,15 +312,15 @@ def _read_episode_tasks(meta: LeRobotMeta) -> dict[int, list[str]]:
     if meta.version == 2:
         for text in files.read_text(lines).splitlines():
             row = files.decode_json(text, lines) if text.strip() else {}
-            if isinstance(row.get("tasks"), list):
-                episode_tasks[row["episode_index"]] = [str(task) for task in row["tasks"]]
+            if isinstance(row, dict) and isinstance(row.get("tasks"), list):
+                number = files.get_entry(row, "episode_index", int, lines)
+                episode_tasks[number] = [str(task) for task in row["tasks"]]
         return episode_tasks
-    parquet = import_optional("pyarrow.parquet")
     for table in sorted((meta.root / "meta" / "episodes").glob("*/*.parquet")):
-        if "tasks" in parquet.read_schema(table).names:
-            content = parquet.read_table(table, columns=["episode_index", "tasks"])
-            rows = zip(content.column("episode_index").to_pylist(), content.column("tasks").to_pylist(), strict=True)
-            episode_tasks |= {number: list(tasks) for number, tasks in rows if isinstance(tasks, list)}
+        if "tasks" in read_parquet_header(table).columns:
+            content = read_columns(table, ["episode_index", "tasks"])
+            rows = zip(np.asarray(content["episode_index"]).tolist(), content["tasks"], strict=True)
+            episode_tasks |= {number: [*map(str, tasks)] for number, tasks in rows if isinstance(tasks, list)}
     return episode_tasks
 
 

@@ -190,9 +190,9 @@ class LeRobotTarget:
         try:
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
-        except (OSError, ValueError, KeyError):
+            return summary if summary["key"] == self.key else None
+        except (OSError, ValueError, KeyError, TypeError):
             return None
-        return summary if summary["key"] == self.key and all(map(is_whole, self._geometry_files(k))) else None
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`DatasetTarget.assemble`."""

@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.extract.columns import Column, Row, arrow_schema, arrow_table
 from dhtorch.extract.plan import ShardSpec
@@ -106,11 +107,15 @@ def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     parquet = import_optional("pyarrow.parquet")
     try:
         metadata = parquet.read_metadata(path).metadata or {}
-        return storage.parse_strict_json(metadata[_SHARED_METADATA_KEY].decode()), storage.parse_strict_json(
-            metadata[_SHARD_METADATA_KEY].decode()
-        )
+        keys = (_SHARED_METADATA_KEY, _SHARD_METADATA_KEY)
+        shared, own = (storage.parse_strict_json(metadata[key].decode()) for key in keys)
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
+    for name, kind in {"key": str, "config": dict, "columns": dict, "data.digest": str}.items():
+        files.get_entry(shared, name, kind, path)
+    for name, kind in {"of": int, "counts": dict}.items():
+        files.get_entry(own, name, kind, path)
+    return shared, own
 
 
 def _iter_groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:

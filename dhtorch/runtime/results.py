@@ -239,14 +239,26 @@ def compute_result_key(
     return total.hexdigest()
 
 
-def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
-    """Name → path of all files below folders (or single files); names are independent of the folders' locations."""
-    files: dict[str, Path] = {}
+def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path | str]:
+    """Name → path of all files below folders (or single files); names are independent of the folders' locations.
+
+    A link that leads out of its folder is a text: its target's name, size and time, so that nothing outside is read.
+    """
+    files: dict[str, Path | str] = {}
     for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
         below = root.rglob("*") if root.is_dir() else [root]
         paths = [p for p in below if p == root or (p.is_file() and not is_private(p.relative_to(root)))]
-        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in paths}
+        names = (p.relative_to(root).as_posix() if p != root else p.name for p in paths)
+        files |= {f"{k}/{name}": _path_inside(p, root) for name, p in zip(names, paths, strict=True)}
     return files
+
+
+def _path_inside(path: Path, root: Path) -> Path | str:
+    """The path, or for a link that leads out of the folder ``root`` a text with its target, size and time."""
+    if path == root or not path.is_symlink() or path.resolve().is_relative_to(root.resolve()):
+        return path
+    status = path.stat()
+    return f"link to {path.readlink()} {status.st_size} {status.st_mtime_ns}"
 
 
 def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
@@ -254,15 +266,18 @@ def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
     return {f"settings/{name}": path for name, path in _iter_paths("", settings) if path.is_file()}
 
 
-def compute_data_digest(files: Mapping[str, str | Path]) -> str:
+def compute_data_digest(files: Mapping[str, Path | str]) -> str:
     """SHA-256 over data files: relative names, sizes, first and last 64 KiB; no files for synthetic data.
 
     Args:
-        files: relative name → path; the path itself does not enter.
+        files: relative name → path, which itself does not enter, or a text, which does.
     """
     total = hashlib.sha256()
     for name in sorted(files):
-        path = Path(files[name])
+        path = files[name]
+        if isinstance(path, str):
+            _update_digest(total, f"{name} {path}".encode())
+            continue
         size = path.stat().st_size
         _update_digest(total, f"{name} {size}".encode())
         with path.open("rb") as file:
@@ -270,6 +285,29 @@ def compute_data_digest(files: Mapping[str, str | Path]) -> str:
             file.seek(max(0, size - _DIGEST_EDGE_BYTES))
             _update_digest(total, file.read(_DIGEST_EDGE_BYTES))
     return total.hexdigest()
+
+
+def check_same_run(file: Path, here: Mapping[str, Any], writer: str) -> None:
+    """Check that the metadata of a folder are those of this run.
+
+    Args:
+        file: JSON that an earlier run wrote.
+        here: metadata of this run, with ``key``.
+        writer: the command that writes such files, for the message.
+
+    Raises:
+        FileExistsError: the file is damaged, or of other settings, data or code.
+    """
+    try:
+        there = parse_strict_json(file.read_text(encoding="utf-8"))
+        difference = "" if there["key"] == here["key"] else describe_difference(there, here)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        problem = f"{type(error).__name__} {error}"
+        raise FileExistsError(f"{file}: found {problem}, expected a file written by dhtorch {writer}") from None
+    if difference:
+        raise FileExistsError(
+            f"{file}: found files of another run ({difference}), expected the same settings or another out=DIR"
+        )
 
 
 def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
@@ -280,7 +318,7 @@ def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
             return f"{name} {there_values.get(name)} there, {here_values.get(name)} here"
     if there["data"]["digest"] != here["data"]["digest"]:
         return "other data"
-    versions = [meta["git"] or meta["version"] for meta in (there, here)]
+    versions = [meta.get("git") or meta.get("version") for meta in (there, here)]
     return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
 
 

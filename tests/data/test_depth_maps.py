@@ -1,6 +1,7 @@
 """Folders of depth maps as other tools write them: clips in one file, masks, units, sentinels, numbering."""
 
 import io
+import shutil
 import struct
 import warnings
 import zipfile
@@ -198,3 +199,38 @@ def test_the_unit_of_a_folder_above_is_not_taken(tmp_path, room, truth):
     ):
         open_depth_maps(tmp_path / "depth", room)
     assert np.allclose(read_all(open_depth_maps(tmp_path / "depth", room, "m")), truth)
+
+
+@pytest.mark.parametrize("shape", [(N, 0, 96), (0, 72, 96), (N, 72, 0)])
+def test_a_clip_without_pixels_is_refused(tmp_path, room, shape):
+    np.save(tmp_path / "clip.npy", np.zeros(shape, np.float32))
+    with pytest.raises(FormatError, match=r"clip\.npy: depth: found shape .*, expected \(height, width\)"):
+        open_depth_maps(tmp_path, room)
+
+
+@pytest.mark.parametrize("linked", ["2.npy", "depth", "complete.json", "clip.npy", "gone.npy"])
+def test_links_that_leave_the_folder_are_refused(tmp_path, room, truth, linked):
+    outside, root = tmp_path / "outside", tmp_path / "maps"
+    for folder in (outside, root / "depth"):
+        folder.mkdir(parents=True)
+        for k in range(N):
+            np.save(folder / f"{k}.npy", truth[k])
+    (outside / "complete.json").write_text('{"unit_m": 0.5}')
+    np.save(outside / "clip.npy", truth)
+    link, target = root / "depth" / linked, outside / linked
+    if linked in ("depth", "complete.json"):
+        link, target = root / linked, outside if linked == "depth" else outside / linked
+    if linked in ("depth", "clip.npy"):
+        shutil.rmtree(root / "depth")
+        link.parent.mkdir(exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(target)
+    with pytest.raises(FormatError, match=r": (link: found one to outside|file: found no such file)") as refused:
+        open_depth_maps(root, room)
+    assert "\n" not in str(refused.value)
+    if linked == "2.npy":
+        link.unlink()
+        np.save(root / "depth" / "real.bin.npy", truth[2])
+        (root / "depth" / "real.bin.npy").rename(root / "real.bin")
+        link.symlink_to("../real.bin")
+        assert np.array_equal(read_all(open_depth_maps(root, room)), truth), "links inside the folder are read"

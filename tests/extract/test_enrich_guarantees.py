@@ -19,6 +19,7 @@ import torch
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
+import pyarrow
 from PIL import Image
 from pyarrow import parquet
 from support.dataset_folders import decode_map, read_files, read_rows
@@ -28,6 +29,7 @@ from dhtorch import testing as writers
 from dhtorch.cli import capture_checks
 from dhtorch.cli.run import main
 from dhtorch.data.codecs import tfrecord
+from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rlds import StepFeature
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
@@ -135,7 +137,7 @@ def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
     parquet.write_table(changed.set_column(place, "timestamp", [np.asarray(changed["timestamp"]) + 1e-7]), table)
     assert main(["enrich", str(source), str(out), *ASKED]) == 2
     said = capsys.readouterr().err
-    assert "the data set of another run" in said and "data" in said and said.count("\n") == 1
+    assert "files of another run" in said and "data" in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("format", ["lerobot", "nerfstudio"])
@@ -540,3 +542,88 @@ def test_a_name_that_leads_elsewhere_is_refused(robot, tmp_path, capsys):
     info.write_text(json.dumps(about))
     assert main(["enrich", str(source), str(tmp_path / "a" / "b" / "set"), *ASKED]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "gone").exists()
+
+
+def change_column(table, name, values):
+    """Replace a column of a table on disk by other values."""
+    content = parquet.read_table(table)
+    parquet.write_table(content.set_column(content.column_names.index(name), name, [values]), table)
+
+
+@pytest.mark.parametrize("value", [1e30, 0.5, -1, float("nan"), "0", 10**6, True])
+def test_a_task_index_that_is_no_count_is_refused(robot, tmp_path, value):
+    source = tmp_path / "source"
+    shutil.copytree(robot, source)
+    table = next((source / "data").rglob("*.parquet"))
+    change_column(table, "task_index", [value] * sum(LENGTHS))
+    with pytest.raises(FormatError, match=r"task_index: found .*, expected a whole number from 0 to 999999") as refused:
+        list(LeRobotSource.open(source, [0]).batches(0, []))
+    assert str(refused.value).startswith(str(table)) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("value", [1e30, 0.5, -1, float("nan"), "0", 10**6, None])
+def test_tasks_of_the_metadata_are_numbered_by_counts(robot, tmp_path, value):
+    source = tmp_path / "source"
+    shutil.copytree(robot, source)
+    table = source / "meta" / "tasks.parquet"
+    parquet.write_table(pyarrow.table({"task_index": [value], "task": ["pick"]}), table)
+    with pytest.raises(FormatError, match="task_index: found ") as refused:
+        LeRobotSource.open(source, [0])
+    assert str(refused.value).startswith(str(table)) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "line", ["[1]", "null", "3", '"x"', '{"tasks": ["a"]}', '{"tasks": ["a"], "episode_index": []}']
+)
+def test_lines_of_episodes_with_other_types_are_left_or_named(tmp_path, line):
+    writers.write_lerobot(tmp_path, [room()[:2]], version=2)
+    file = tmp_path / "meta" / "episodes.jsonl"
+    source = LeRobotSource.open(tmp_path, [0])
+    words = source.words(0)
+    file.write_text(file.read_text().rstrip("\n") + f"\n{line}\n")
+    if "tasks" in line:
+        with pytest.raises(FormatError, match=r"episodes\.jsonl: episode_index: found"):
+            source.words(0)
+    else:
+        assert source.words(0) == words
+
+
+@pytest.mark.parametrize(
+    "name", ["data/*/*.parquet", "meta/tasks.parquet", "meta/episodes/*/*.parquet", "meta/stats.json", "README.md"]
+)
+def test_links_that_leave_a_data_set_are_not_read(robot, tmp_path, name):
+    outside, source = tmp_path / "outside", tmp_path / "source"
+    for folder in (outside, source):
+        shutil.copytree(robot, folder)
+        (folder / "README.md").write_text("about")
+        (folder / "meta" / "stats.json").write_text('{"action": {"min": [0]}}')
+    (path,) = source.glob(name)
+    path.unlink()
+    path.symlink_to(outside / path.relative_to(source))
+
+    def read_all(bounds):
+        opened = LeRobotSource.open(source, [0], bounds=bounds)
+        rows = sum(part.num_rows for part in opened.batches(0, []))
+        return rows, opened.words(0), opened.stats, [*opened.more]
+
+    rows, _, stats, more = read_all(None)
+    assert rows == LENGTHS[0] and stats and "README.md" in more
+    if name.endswith((".json", ".md")):
+        _, _, stats, more = read_all(source)
+        assert (stats == {}) == name.endswith(".json")
+        assert ("README.md" not in more) == name.endswith(".md"), "left out, as other files may be"
+        return
+    with pytest.raises(FormatError, match="link: found one to outside the capture"):
+        read_all(source)
+
+
+@pytest.mark.parametrize("content", ["null", "[]", "7", '"x"', "{}", "", '{"key": 1}', '{"key": null, "config": 3}'])
+@pytest.mark.parametrize("format", ["lerobot", "nerfstudio"])
+def test_metadata_of_other_types_are_no_folder_of_enrich(robot, tmp_path, capsys, content, format):
+    out = tmp_path / "set"
+    (out / "meta").mkdir(parents=True)
+    (out / "meta" / "dhtorch.json").write_text(content)
+    assert main(["enrich", str(robot), str(out), *ASKED, "data=lerobot", "data.episode=0", f"format={format}"]) == 2
+    message = capsys.readouterr().err
+    assert "dhtorch.json: found " in message and message.count("\n") == 1
+    assert [*read_files(out)] == ["meta/dhtorch.json"], "nothing is written"

@@ -697,3 +697,42 @@ def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
     assert commit() == "v7"
     monkeypatch.setenv("PATH", str(tmp_path))
     assert commit() is None
+
+
+def test_a_link_that_leaves_the_folder_is_not_read(tmp_path):
+    """Its target's name, size and time enter the digest; a link within the folder is a file."""
+    root, outside = tmp_path / "set", tmp_path / "outside"
+    root.mkdir()
+    outside.write_text("secret")
+    (root / "a").write_text("a")
+    (root / "inner").symlink_to("a")
+    (root / "link").symlink_to(outside)
+    files = result_files.list_files_below([root])
+    assert files["0/inner"] == root / "inner" and files["0/link"].startswith(f"link to {outside} 6 ")
+    outside.chmod(0)
+    status = outside.stat()
+    first = result_files.compute_data_digest(files)
+    outside.chmod(0o600)
+    outside.write_text("SECRET")
+    os.utime(outside, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert first == result_files.compute_data_digest(result_files.list_files_below([root])), "the content was read"
+    outside.write_text("longer than before")
+    assert first != result_files.compute_data_digest(result_files.list_files_below([root]))
+
+
+@pytest.mark.parametrize(
+    "content", ["null", "[]", "7", '"x"', "{}", "", '{"key": 1}', '{"key": 1, "config": {}, "data": 3}']
+)
+def test_metadata_of_other_types_are_no_run(tmp_path, content):
+    file = tmp_path / "about.json"
+    file.write_text(content)
+    with pytest.raises(
+        FileExistsError, match=r"about\.json: found .*, expected a file written by dhtorch complete"
+    ) as refused:
+        result_files.check_same_run(file, {"key": "a", "config": {}, "data": {"digest": ""}}, "complete")
+    assert "\n" not in str(refused.value)
+    here = {"key": "a", "config": {"n": 1}, "data": {"digest": "d"}, "git": "v1", "version": "0"}
+    file.write_text(json.dumps(here))
+    result_files.check_same_run(file, here, "complete")
+    with pytest.raises(FileExistsError, match=r"another run \(n 1 there, 2 here\)"):
+        result_files.check_same_run(file, {**here, "key": "b", "config": {"n": 2}}, "complete")

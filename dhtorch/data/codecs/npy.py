@@ -12,14 +12,16 @@ import struct
 import warnings
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
-from dhtorch.data.io.safe_open import check_memory
+from dhtorch.data.io.safe_open import check_memory, open_regular
 
 #: Largest size of a header in bytes.
 _MAX_HEADER_BYTES = 12_288
@@ -94,20 +96,27 @@ def _smallest_float_dtype(dtype: np.dtype) -> type[np.floating]:
     return np.float32 if exact else np.float64
 
 
-def list_npz(file: Path) -> set[str]:
-    """Names of the arrays of an ``.npz`` archive, after checking the memory that all of them take.
+def list_npz_members(file: Path) -> list[str]:
+    """Names of the members of an ``.npz`` archive, in its order.
 
     Raises:
-        FormatError: missing or damaged archive, or larger than the memory limit allows.
+        FormatError: missing or damaged archive.
     """
-    data = read_bytes(file)
-    check_zip_directory(io.BytesIO(data), file)
+    with open_regular(file) as stream:
+        check_zip_directory(stream, file)
+        with _open_archive(stream, file) as archive:
+            return archive.namelist()
+
+
+@contextmanager
+def _open_archive(stream: BinaryIO, file: Path) -> Iterator[zipfile.ZipFile]:
+    """The archive of a stream, with its errors as FormatError."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-            check_memory(file, "arrays", size, f"{size} bytes unpacked", len(data))
-            return {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
-    except (zipfile.BadZipFile, ValueError) as error:
+        with zipfile.ZipFile(stream) as archive:
+            yield archive
+    except FormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(file, "archive", error, "a whole .npz archive") from None
 
 
@@ -118,28 +127,22 @@ def read_npz(file: Path, key: str) -> np.ndarray:
         FormatError: missing or damaged archive, no such key, not numeric, or larger than declared or than
             ``MAX_FILE_BYTES``.
     """
-    try:
-        data = read_bytes(file)
-        check_zip_directory(io.BytesIO(data), file)
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if f"{key}.npy" not in archive.namelist():
-                raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
-            if (count := archive.namelist().count(f"{key}.npy")) > 1:
-                raise FormatError(file, "key", f"{count} members {key}.npy", "one")
-            member = archive.getinfo(f"{key}.npy")
-            if member.file_size > MAX_FILE_BYTES:
-                raise FormatError(
-                    file, key, "an array that unpacks beyond the limit", f"at most {MAX_FILE_BYTES} bytes"
-                )
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
-            with archive.open(member) as stream:
-                header = parse_real_npy_header(file, key, stream.read(_MAX_HEADER_BYTES))
-            takes = member.file_size + math.prod(header.shape) * np.dtype(_smallest_float_dtype(header.dtype)).itemsize
-            check_memory(file, key, takes, f"{header.shape} of {header.dtype}", len(data))
-            raw = archive.read(member)
-    except FormatError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
-        raise FormatError(file, "archive", error, "a whole .npz archive") from None
+    data = read_bytes(file)
+    check_zip_directory(io.BytesIO(data), file)
+    with _open_archive(io.BytesIO(data), file) as archive:
+        names = archive.namelist()
+        if f"{key}.npy" not in names:
+            raise FormatError(file, "key", ", ".join(sorted(names)[:8]) or "nothing", f"{key}.npy")
+        if (count := names.count(f"{key}.npy")) > 1:
+            raise FormatError(file, "key", f"{count} members {key}.npy", "one")
+        member = archive.getinfo(f"{key}.npy")
+        if member.file_size > MAX_FILE_BYTES:
+            raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_FILE_BYTES} bytes")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
+        with archive.open(member) as stream:
+            header = parse_real_npy_header(file, key, stream.read(_MAX_HEADER_BYTES))
+        takes = member.file_size + math.prod(header.shape) * np.dtype(_smallest_float_dtype(header.dtype)).itemsize
+        check_memory(file, key, takes, f"{header.shape} of {header.dtype}", len(data))
+        raw = archive.read(member)
     return _decode_real_npy(file, key, raw)

@@ -45,7 +45,7 @@ def open_regular(file: Path) -> Iterator[BinaryIO]:
     """
     try:
         mode = file.stat().st_mode  # before opening: opening alone triggers some devices
-        _check_link(file)
+        check_link(file)
         if not stat.S_ISREG(mode):
             raise FormatError(file, "file", _FILE_KINDS.get(stat.S_IFMT(mode), "something else"), "a regular file")
         stream = os.fdopen(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
@@ -113,8 +113,8 @@ def is_inside(file: Path, root: Path) -> bool:
     return file.resolve().is_relative_to(folder.parent if root.is_file() else folder)
 
 
-def _check_link(file: Path) -> None:
-    """Raise FormatError for a link that points outside the capture being read."""
+def check_link(file: Path) -> None:
+    """Raise FormatError for a link that points outside the capture being read (see :func:`restrict_links`)."""
     root = _restricted_root.get()
     if root is None or not file.is_relative_to(root):
         return
