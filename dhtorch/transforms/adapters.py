@@ -11,22 +11,23 @@ directly, before any crop: a crop would not adapt the intrinsics. kornia's conta
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
 from dhtorch.runtime.allocator import disable_malloc_trim
+from dhtorch.transforms import layout
 from dhtorch.transforms.collate import collate_shared, pack_shared
 from dhtorch.transforms.declared_unit import declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
 from dhtorch.transforms.sample_spec import AUTO_UNIT
 
-#: Maximum distance of the neighbour whose shapes replace those of an item that cannot be loaded.
-_MAX_NEIGHBOURS_TRIED = 16
+#: Number of items, first ones and neighbours each, that are tried for the shapes of one that cannot be loaded.
+_MAX_ITEMS_TRIED = 16
 
 
 class _DatasetWrapper:
@@ -47,7 +48,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     transform's ``other_image`` while the transform runs. Without such an item only the front end runs.
 
     A corrupt item, whose loading raises, is treated by the transform's ``on_error``: with ``flag`` it is replaced by
-    zeros in the shapes of a neighbour, and its ``problem`` is UNREADABLE.
+    zeros in the shapes of the first item that can be read, and its ``problem`` is UNREADABLE. So is an item that lacks
+    a key of the transform, or has it with another type or shape: only these values become zeros.
 
     Args:
         dataset: ``dataset[i]`` is a dict.
@@ -62,7 +64,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
 
     Raises:
         ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one made
-            with ``batched=False`` or one that does not raise; a consumed key that the transform does not read;
+            with ``batched=False`` or one that skips; a consumed key that the transform does not read;
             ``depth_unit="auto"`` of a data set that declares none.
     """
 
@@ -83,8 +85,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
             transform = transform.with_options(batched=True)
         elif transform.batched:
             raise ValueError("found a transform for batches, expected one for single samples, or by_batch=True")
-        if by_batch and transform.on_error != "raise":
-            raise ValueError(f"on_error is {transform.on_error!r}, expected raise where by_batch is set")
+        if by_batch and transform.on_error == "skip":
+            raise ValueError("on_error is 'skip', expected raise or flag where by_batch is set")
         keys = transform.views.keys()
         if isinstance(consumed, str) or not set(consumed) <= set(keys):
             raise ValueError(f"consumed is {consumed!r}, expected a list of some of {', '.join(keys)}")
@@ -97,6 +99,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         )  # keys added by a gap while the transform runs
         if views.pose is not None and views.other_pose is not None:
             self._gap_keys += (views.other_pose,)
+        # Zeros in the shapes of the first good item; empty = there is none, None = not looked for.
+        self._layout: dict[str, Any] | None = None
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -105,15 +109,31 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         i = range(len(self))[index]
         try:
             sample = self._load(i)
-            if self.by_batch:
-                return sample
         except Exception as error:  # any error of a decoder; lack of memory is no property of a sample
             if self.transform.on_error == "raise" or isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
-            blank = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
-            out = self.transform.left_out(blank, SampleError(f"item {i} cannot be loaded: {error}"))
-            return self._drop_internal(out)
+            blank = {} if self.transform.on_error == "skip" else self._find_layout(i)
+            if self.transform.on_error == "flag" and not blank:
+                raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
+            return self._left_out(dict(blank), f"item {i} cannot be loaded: {error}")
+        if self.transform.on_error == "flag":
+            like, keys = self._find_layout(i), (*self.transform.read_keys, *self._gap_keys)
+            if difference := layout.describe_difference(sample, like, keys):
+                return self._left_out(layout.conform(sample, like, keys), f"item {i}: {difference}")
+        if self.by_batch:
+            return self._marked(sample, False)
         return self._drop_internal(self.transform(sample))
+
+    def _left_out(self, sample: dict[str, Any], reason: str) -> dict[str, Any] | None:
+        """Item that is not read, with all keys -> result for it; of a loader by batch the item with its mark."""
+        if not self.by_batch:
+            return self._drop_internal(self.transform.left_out(sample, SampleError(reason)))
+        warnings.warn(f"flagged: {reason}", stacklevel=4)
+        return self._marked(sample, True)
+
+    def _marked(self, sample: dict[str, Any], is_unreadable: bool) -> dict[str, Any]:
+        """Item with the mark of those not read, where the transform flags them."""
+        return sample if self.transform.on_error == "raise" else {**sample, layout.UNREADABLE_KEY: is_unreadable}
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
         """Samples -> batch by torch's default collate, with ``by_batch`` then transformed as a whole.
@@ -140,12 +160,15 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     def _drop_internal(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Drop the keys that a gap added, and the consumed keys."""
         dropped = (*self.consumed, self.transform.views.metric_depth_key) if self.consumed else ()
+        dropped = (*dropped, layout.UNREADABLE_KEY) if self.by_batch and self.transform.on_error == "flag" else dropped
         dropped = dropped if self.gap is None else (*dropped, *self._gap_keys)
         return drop_keys(out, dropped) if out is not None and dropped else out
 
     def _load(self, i: int) -> dict[str, Any]:
         """Item ``i``, with ``gap`` plus the source view from an earlier item."""
         sample = self.dataset[i]
+        if not isinstance(sample, Mapping) and self.transform.on_error == "flag":
+            raise SampleError(f"found {type(sample).__name__}, expected a dict with pictures and depth")
         if self.gap is None:
             self._require_source_view(sample)
             return sample
@@ -172,20 +195,26 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     def _episode(self, sample: Mapping[str, Any]) -> int:
         return 0 if self.episode_key is None else int(get_value(sample, self.episode_key))
 
-    def _zeros_like_neighbour(self, i: int, error: Exception) -> dict[str, Any]:
-        """Zeros in the shapes of the nearest item that can be loaded.
-
-        Raises:
-            SampleError: no neighbour within the maximum distance can be loaded.
+    def _find_layout(self, i: int) -> dict[str, Any]:
+        """Zeros in the shapes of the first item that can be read; of item ``i`` or its neighbours where the first
+        cannot; empty where none of them can.
         """
-        for k in (i + sign * step for step in range(1, _MAX_NEIGHBOURS_TRIED) for sign in (1, -1)):
-            if not 0 <= k < len(self):
-                continue
-            try:
-                return {key: _zeros_like(value) for key, value in self.dataset[k].items()}
-            except Exception:
-                continue  # corrupt as well
-        raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
+        if self._layout is None:
+            near = [i, *(i + sign * step for step in range(1, _MAX_ITEMS_TRIED) for sign in (1, -1))]
+            places = dict.fromkeys([*range(_MAX_ITEMS_TRIED), *near])
+            readable = (sample for k in places if (sample := self._load_readable(k)) is not None)
+            self._layout = layout.zeros_like(next(readable, {}))
+        return self._layout
+
+    def _load_readable(self, k: int) -> dict[str, Any] | None:
+        """Item ``k``, None where there is none that the transform can read."""
+        if not 0 <= k < len(self):
+            return None
+        try:
+            sample = self._load(k)
+            return None if bool(self.transform.views.read(sample).bad.any()) else sample
+        except Exception:
+            return None  # corrupt as well
 
 
 class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
@@ -278,16 +307,3 @@ def _resolve_unit(transform: ExtendDepth, dataset: Any) -> ExtendDepth:
 def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
     """Values of a key in all samples, as tensors."""
     return [to_tensor(get_value(sample, key), key, signed=False) for sample in samples]
-
-
-def _zeros_like(value: Any) -> Any:
-    """Value -> zeros of the same structure, shape and type."""
-    if isinstance(value, Mapping):
-        return {k: _zeros_like(v) for k, v in value.items()}
-    if isinstance(value, str | bytes):
-        return type(value)()
-    if isinstance(value, list | tuple):
-        return type(value)(_zeros_like(v) for v in value)
-    if isinstance(value, bool | int | float):
-        return type(value)(0)
-    return torch.zeros_like(value) if isinstance(value, torch.Tensor) else np.zeros_like(value)

@@ -20,8 +20,8 @@ from dhtorch.pipeline.presets import get_method
 from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.runtime.numerics import standard_numerics
-from dhtorch.transforms import maps, poses, schema
-from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
+from dhtorch.transforms import layout, maps, poses, schema
+from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, has_key, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews, default_prefix
 from dhtorch.transforms.status import ProblemCounts, SampleProblem
 from dhtorch.transforms.tokens import FIT_MODES, patch_tokens, token_grid
@@ -50,7 +50,9 @@ class ExtendDepth(torch.nn.Module):
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transforms.patch_tokens`.
         on_error: what to do with a sample that cannot be read, or whose values contradict the options. ``raise``;
             ``skip`` = return None, see :func:`dhtorch.transforms.collate_kept`; ``flag`` = add zeros and set
-            ``problem`` to UNREADABLE. Skipped and flagged samples are counted (:meth:`report`) and raise a warning.
+            ``problem`` to UNREADABLE; keys that are read get zeros too where they are missing, of another shape than in
+            the first good sample, or not finite. Skipped and flagged samples are counted (:meth:`report`) and raise a
+            warning.
         batched: True = samples are collated batches, False = single samples. None = single samples, and a sample that
             looks like a batch (3x3 intrinsics, texts, an index or episode for each image) is rejected instead of being
             read as frames along time. A batch with a missing key or a wrong shape raises in any case.
@@ -121,6 +123,7 @@ class ExtendDepth(torch.nn.Module):
         self._batched_option = batched
         self.tally = ProblemCounts()
         self._seen_hw: tuple[int, int] | None = None
+        self._layout: dict[str, Any] | None = None  # zeros in the shapes of the first good sample, with on_error=flag
 
     def __repr__(self) -> str:
         dense = "" if self.maps is None else ", dense maps"
@@ -155,7 +158,7 @@ class ExtendDepth(torch.nn.Module):
         check_sample(sample, self.views.image, self.views.intrinsics, self._batched_option)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
-                read = self.views.read(sample, batched=self.batched)
+                read = _with_marks(self.views.read(sample, batched=self.batched), sample)
                 seed = self._seeds(sample, len(read.bad))
                 flagged = bool(read.complaints) and bool(read.bad.any())
                 if flagged and not (self.batched and self.on_error == "flag"):
@@ -164,11 +167,20 @@ class ExtendDepth(torch.nn.Module):
                 if self.on_error == "raise" or self.batched:
                     raise
                 return self.left_out(sample, error)
-            if flagged:
-                warnings.warn(f"flagged: {read.complaint()}", stacklevel=3)
+            if flagged and (complaint := read.complaint()):
+                warnings.warn(f"flagged: {complaint}", stacklevel=3)
             added = self._compute_columns(read, seed, flagged)
         self._count_problems(added["problem"], read.reference.hw)
+        if flagged:
+            sample = layout.clear_non_finite(sample, self.views.number_keys(), read.bad)
+        elif self.on_error == "flag" and self._layout is None and not self.batched:
+            self._layout = {k: layout.zeros_like(get_value(sample, k)) for k in self.read_keys if has_key(sample, k)}
         return self._add_columns(sample, added)
+
+    @property
+    def read_keys(self) -> tuple[str, ...]:
+        """The keys that are read from a sample."""
+        return (*self.views.keys(), *(() if self.index_key is None else (self.index_key,)))
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem since the transform was constructed, summed over all workers."""
@@ -180,6 +192,9 @@ class ExtendDepth(torch.nn.Module):
         Raises:
             SampleError: ``on_error`` is flag, and the image size is unknown.
         """
+        if self.on_error == "flag":
+            sample = layout.clear_non_finite(sample, self.views.number_keys())
+            sample = sample if self._layout is None else layout.conform(sample, self._layout, self.read_keys)
         hw = (None if self.maps else self.tokens_hw) or self.views.image_hw(sample) or self._seen_hw
         if self.on_error == "flag" and hw is None:
             missing = "maps" if self.maps else "tokens: give tokens_hw"
@@ -280,6 +295,17 @@ def _run_uncompiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return torch.compiler.disable(
         function, reason="ExtendDepth reads a sample in Python, and its control flow depends on values"
     )
+
+
+def _with_marks(read: SampleViews, batch: Mapping[str, Any]) -> SampleViews:
+    """Views of a batch, bad also where its items are marked as not read; their messages were shown before."""
+    if layout.UNREADABLE_KEY not in batch:
+        return read
+    marked = to_tensor(batch[layout.UNREADABLE_KEY], layout.UNREADABLE_KEY).to(read.bad)
+    if not bool(marked.any()):
+        return read
+    complaint = (marked, marked.float(), "")
+    return read._replace(bad=read.bad | marked, complaints=(complaint, *read.complaints))
 
 
 def _problem_codes(read: SampleViews, flagged: bool) -> list[int]:

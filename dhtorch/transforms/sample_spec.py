@@ -62,10 +62,12 @@ class SampleViews(NamedTuple):
     pose_prior: PosePrior | None = None  # motion to the source view, if samples hold one; leading dims as of other
 
     def complaint(self) -> str:
-        """Message of the first failed check of the first bad sample."""
-        row = int(self.bad.int().argmax())
-        message = next(text.format(float(value[row])) for bad, value, text in self.complaints if bad[row])
-        return message if len(self.bad) == 1 else f"sample {row} of the batch: {message}"
+        """Message of the first failed check of the first bad sample that has one; empty without one."""
+        for row in self.bad.nonzero()[:, 0].tolist():
+            message = next(text.format(float(value[row])) for bad, value, text in self.complaints if bad[row])
+            if message:  # empty: of an item that was reported when it was loaded
+                return message if len(self.bad) == 1 else f"sample {row} of the batch: {message}"
+        return ""
 
 
 #: Value of ``depth_unit``: the unit that the data set declares.
@@ -210,6 +212,11 @@ class SampleSpec:
         """The keys that are read from a sample, without the ``_is_pad`` keys."""
         values = (getattr(self, name) for name in _KEY_OPTIONS)
         return tuple(dict.fromkeys(key for key in values if isinstance(key, str)))
+
+    def number_keys(self) -> tuple[str, ...]:
+        """The keys whose numbers must be finite: all but those of depth and poses, where NaN means unknown."""
+        unknown = {self.depth, self.metric_depth_key, self.pose, self.other_pose, self.pose_cov}
+        return tuple(key for key in self.keys() if key not in unknown)
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the reference image of a sample, None if it cannot be read."""

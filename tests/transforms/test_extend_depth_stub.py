@@ -369,7 +369,7 @@ def test_tokens_of_a_picture_that_is_missing_take_the_size_last_seen():
         assert added(extender(lost))["tokens"].shape == (4 * 6, 10)
     small = sample(image=sample()["image"][:14], depth="x")
     with pytest.warns(UserWarning, match="depth"):
-        assert added(extender(small))["tokens"].shape == (2 * 6, 10), "its own picture goes first"
+        assert added(extender(small))["tokens"].shape == (4 * 6, 10), "as of the first good sample"
     with pytest.warns(UserWarning, match="image"):
         assert added(tiny(on_error="flag", patch=7, tokens_hw=(21, 7))(lost))["tokens"].shape == (3, 10)
 
