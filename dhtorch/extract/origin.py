@@ -26,7 +26,14 @@ DEFAULT_FPS = 30.0
 #: Largest number of tasks of a data set. Source: derived, more than the episodes of any published set.
 _MAX_TASKS = 10**6
 
-#: Files of ``meta/`` that are rewritten instead of copied.
+#: Data set card of the source beside that of the enriched set.
+SOURCE_CARD = "README.source.md"
+
+#: Files of ``meta/`` that state which run wrote an enriched set, and with which result: those of a source that is one
+#: itself are not copied.
+METADATA_FILE, REPORT_FILES = "dhtorch.json", ("report.json", "report.html")
+
+#: Files that are rewritten or belong to the source's own run, and are not copied.
 _REWRITTEN_META_FILES = (
     METADATA_FILE,
     *REPORT_FILES,
