@@ -68,7 +68,7 @@ def occupied_cells(
         raise ValueError(f"occupied_cells: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
     in_range = (scaled.abs() < CELL_RANGE).all(-1)  # false for NaN
-    return pack_cells(scaled[in_range].floor().long()).unique()
+    return pack_cells(scaled[in_range].floor().long()).unique_consecutive().unique()
 
 
 def touches_cells(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -89,6 +89,7 @@ def _fuse_sources(
         for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
             yield _make_view(recording, k, read(k), source, poses[k])
 
+    fuse = partial(fuse_views, max_reach=MAX_REACH_TRUNCATIONS, in_place=True)
     *finer, last = volumes
     for k in poses:
         last = reserve_blocks(
@@ -96,10 +97,10 @@ def _fuse_sources(
         )
     volumes = [*finer, last]
     for view in views(Source.SENSOR):
-        volumes = [fuse_views(volume, view, max_reach=MAX_REACH_TRUNCATIONS) for volume in volumes]
+        volumes = [fuse(volume, view) for volume in volumes]
     *finer, last = volumes
     for view in views(Source.SWEPT):
-        last = fuse_views(last, view, source=Source.SWEPT, max_reach=MAX_REACH_TRUNCATIONS)
+        last = fuse(last, view, source=Source.SWEPT)
     return [*finer, drop_unconfirmed(last, min(_MIN_AGREEING_MAPS, len(poses)))]
 
 

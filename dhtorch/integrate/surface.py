@@ -18,6 +18,8 @@ from dhtorch.pytree import Record, collate, record
 _MAX_STEP_TRUNCATIONS = 1.5
 #: Blocks along the side of one brick of the mesh extraction.
 _BRICK_BLOCKS = 8
+#: Bits of a voxel's position within its block, per axis. Source: derived, log2 of BLOCK_SIDE.
+_SIDE_BITS = BLOCK_SIDE.bit_length() - 1
 #: Points whose attributes are interpolated at a time; bounds the memory.
 _POINTS_PER_CHUNK = 1 << 18
 #: Distance to a voxel, in voxels, below which a vertex of the mesh counts as lying on it.
@@ -49,13 +51,15 @@ def extract_points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     Gradient: none.
     """
     _check_volume(min_weight)
-    edges = [_crossing_edges(volume, axis, min_weight) for axis in range(3)]
+    table = _VoxelTable(volume, min_weight)
+    edges = [_crossing_edges(table, axis) for axis in range(3)]
     a, b = (torch.cat([pair[k] for pair in edges]) for k in (0, 1))
     order = sparse_grid.pack_cells(a + b).argsort()  # sorted by position: independent of the order of fusion
     a, b = a[order], b[order]
-    front, back = _distance(volume, a), _distance(volume, b)
+    numbers = table.number(torch.stack((a, b)))
+    front, back = table.at(numbers)
     t = front / (front - back)
-    return _interpolate(volume, a, b, t, (a + t[:, None] * (b - a)) * volume.voxel)
+    return _interpolate(table, numbers, t, (a + t[:, None] * (b - a)) * volume.voxel)
 
 
 def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
@@ -80,8 +84,9 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
         raise ImportError("extract_mesh: found no scikit-image, expected it: pip install scikit-image") from error
+    table = _VoxelTable(volume, min_weight)
     vertices, faces, count = [], [], 0
-    for origin, distance, observed in _dense_bricks(volume, min_weight):
+    for origin, distance, observed in _dense_bricks(table):
         cell = _meshable_cells(distance, observed, _MAX_STEP_TRUNCATIONS * volume.truncation)
         if not bool(cell.any()):
             continue
@@ -97,13 +102,14 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
         count += len(mesh[0])
     if not count:
         empty = torch.zeros(0, 3, dtype=torch.int64)
-        return _interpolate(volume, empty, empty, volume.distance.new_zeros(0), empty.double()).replace(face=empty)
-    return _weld_vertices(volume, torch.cat(vertices), torch.cat(faces))
+        none = torch.zeros(2, 0, dtype=torch.int64, device=volume.key.device)
+        return _interpolate(table, none, volume.distance.new_zeros(0), empty.double()).replace(face=empty)
+    return _weld_vertices(table, torch.cat(vertices), torch.cat(faces))
 
 
-def _weld_vertices(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
+def _weld_vertices(table: _VoxelTable, vertices: Tensor, faces: Tensor) -> Surface:
     """Surface of a mesh (vertices in voxels) with one vertex per grid edge and without degenerate triangles."""
-    device = volume.key.device
+    volume, device = table.volume, table.volume.key.device
     rounded = vertices.round()
     on_voxel = (vertices - rounded).abs() < _SNAP_VOXELS
     a = torch.where(on_voxel, rounded, vertices.floor()).long()
@@ -114,22 +120,24 @@ def _weld_vertices(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
     not_degenerate = (faces != faces.roll(1, 1)).all(-1)
     a, b, position = a[first].to(device), b[first].to(device), vertices[first].to(device)
     t = ((position - a).sum(-1) / (b - a).sum(-1).clamp_min(1)).to(volume.distance.dtype)
-    return _interpolate(volume, a, b, t, position * volume.voxel).replace(face=faces[not_degenerate].to(device))
+    numbers = table.number(torch.stack((a, b)))
+    return _interpolate(table, numbers, t, position * volume.voxel).replace(face=faces[not_degenerate].to(device))
 
 
-def _interpolate(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
-    """Surface points at fractions ``t`` (P,) between voxels ``a`` and ``b`` (P, 3), computed in chunks."""
-    parts = zip(*(x.split(_POINTS_PER_CHUNK) for x in (a, b, t, xyz)), strict=True)
-    return collate(_interpolate_chunk(volume, *part) for part in parts)
+def _interpolate(table: _VoxelTable, numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
+    """Surface points at fractions ``t`` (P,) between two voxels each, ``numbers`` (2, P), computed in chunks."""
+    parts = zip(*(x.split(_POINTS_PER_CHUNK, -1) for x in (numbers, t)), xyz.split(_POINTS_PER_CHUNK), strict=True)
+    return collate(_interpolate_chunk(table, *part) for part in parts)
 
 
-def _interpolate_chunk(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
-    t = t.to(volume.distance.dtype)[:, None]
-    index, observed = _voxel_slots(volume, torch.stack((a, b)))
+def _interpolate_chunk(table: _VoxelTable, numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
+    volume, t = table.volume, t.to(table.distance.dtype)[:, None]
+    observed = ~table.at(numbers).isnan()
+    index = torch.where(observed, numbers, 0)
     fraction = torch.where(observed[..., None], torch.stack((1 - t, t)), 0.0)
     weight = (volume.weight.flatten(0, 1)[index] * fraction).sum(0) / fraction.sum(0).clamp_min(1e-12)
     feature_sums = (volume.features.flatten(0, 1)[index].to(t.dtype) * fraction).sum(0)
-    gradient = (_distance_gradient(volume, torch.stack((a, b))) * fraction).sum(0)
+    gradient = (table.gradient(numbers) * fraction).sum(0)
     length = gradient.norm(dim=-1, keepdim=True)
     codes = torch.tensor(VOLUME_SOURCES, dtype=torch.int32, device=weight.device)
     return Surface(
@@ -141,46 +149,76 @@ def _interpolate_chunk(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Ten
     )
 
 
-def _distance_gradient(volume: Volume, ijk: Tensor) -> Tensor:
-    """Gradient (…, 3) of the distance per voxel: central differences, one-sided beside unobserved voxels."""
-    here = _distance(volume, ijk)
-    derivatives = []
-    for step in torch.eye(3, dtype=torch.int64, device=ijk.device):
-        ahead, behind = (_distance(volume, ijk + sign * step) for sign in (1, -1))
-        is_central = ahead.isfinite() & behind.isfinite()
-        one_sided = (ahead - here).nan_to_num(0.0) + (here - behind).nan_to_num(0.0)
-        derivatives.append(torch.where(is_central, (ahead - behind) / 2, one_sided))
-    return torch.stack(derivatives, -1)
+class _VoxelTable:
+    """Voxels of a volume by number: 512 for each block in turn, then those of one unobserved block, which stands for
+    all absent ones. Blocks side by side are looked up once."""
+
+    def __init__(self, volume: Volume, min_weight: float) -> None:
+        self.volume = volume
+        total = volume.weight.sum(-1)
+        self.distance = self._pad(torch.where(total > 0, volume.distance, torch.nan))  # NaN = unobserved
+        self.chosen = self.distance  # NaN = unobserved, or with too little weight
+        if min_weight > 0:
+            self.chosen = self._pad(torch.where(total >= min_weight, volume.distance, torch.nan))
+        self._slots = torch.arange(len(volume.key) + 1, device=volume.key.device)
+        self._position = sparse_grid.unpack_cells(volume.key)
+        self._next = {(axis, sign): self._next_slots(axis, sign) for axis in range(3) for sign in (1, -1)}
+
+    def _next_slots(self, axis: int, sign: int) -> Tensor:
+        """Slot (K + 1,) of the block beside each block; K = absent."""
+        wanted = self._position.clone()
+        wanted[:, axis] += sign
+        return torch.cat((self._slot(wanted), self._slots[-1:]))
+
+    def _pad(self, x: Tensor) -> Tensor:
+        """(K, 512) -> (K + 1, 512), the last NaN."""
+        return torch.nn.functional.pad(x, (0, 0, 0, 1), value=torch.nan)
+
+    def _slot(self, block: Tensor) -> Tensor:
+        slot, exists = sparse_grid.find_cells(self.volume.key, sparse_grid.pack_cells(block))
+        return torch.where(exists, slot, len(self.volume.key))
+
+    def number(self, ijk: Tensor) -> Tensor:
+        """Numbers (…,) of voxels ``ijk`` (…, 3)."""
+        block = ijk >> _SIDE_BITS
+        x, y, z = (ijk & (BLOCK_SIDE - 1)).unbind(-1)
+        return (((self._slot(block) << _SIDE_BITS) + x << _SIDE_BITS) + y << _SIDE_BITS) + z
+
+    def at(self, number: Tensor) -> Tensor:
+        """Distances (…,) m of voxels; NaN where unobserved."""
+        return self.distance.flatten()[number]
+
+    def beyond(self, axis: int) -> Tensor:
+        """Slots (K,) of the next blocks along an axis; K = absent."""
+        return self._next[axis, 1][:-1]
+
+    def gradient(self, number: Tensor) -> Tensor:
+        """Gradient (…, 3) of the distance per voxel: central differences, one-sided beside unobserved voxels."""
+        here = self.at(number)
+        derivatives = []
+        for axis in range(3):
+            ahead, behind = (self.at(self._step(number, axis, sign)) for sign in (1, -1))
+            is_central = ahead.isfinite() & behind.isfinite()
+            one_sided = (ahead - here).nan_to_num(0.0) + (here - behind).nan_to_num(0.0)
+            derivatives.append(torch.where(is_central, (ahead - behind) / 2, one_sided))
+        return torch.stack(derivatives, -1)
+
+    def _step(self, number: Tensor, axis: int, sign: int) -> Tensor:
+        """Numbers (…,) of the voxels one step (±1) along an axis."""
+        bits = _SIDE_BITS * (2 - axis)
+        last = BLOCK_SIDE - 1 if sign > 0 else 0
+        jump = (self._next[axis, sign] - self._slots) * BLOCK_VOXELS - (sign * (BLOCK_SIDE - 1) << bits)
+        is_last = (number >> bits) & (BLOCK_SIDE - 1) == last
+        return number + torch.where(is_last, jump[number >> 3 * _SIDE_BITS], sign << bits)
 
 
-def _voxel_slots(volume: Volume, ijk: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices (…,) of voxels in the flattened blocks, and whether they exist and were observed."""
-    block = ijk.div(BLOCK_SIDE, rounding_mode="floor")
-    x, y, z = (ijk - block * BLOCK_SIDE).unbind(-1)
-    slot, exists = sparse_grid.find_cells(volume.key, sparse_grid.pack_cells(block))
-    index = slot * BLOCK_VOXELS + (x * BLOCK_SIDE + y) * BLOCK_SIDE + z
-    if not len(volume.key):
-        return index, exists
-    return index, exists & (volume.weight.flatten(0, 1)[index] > 0).any(-1)
-
-
-def _distance(volume: Volume, ijk: Tensor) -> Tensor:
-    """Distances (…,) at voxels ``ijk`` (…, 3); NaN where unobserved."""
-    index, observed = _voxel_slots(volume, ijk)
-    return torch.where(observed, volume.distance.flatten()[index], torch.nan) if len(volume.key) else observed.float()
-
-
-def _crossing_edges(volume: Volume, axis: int, min_weight: float) -> tuple[Tensor, Tensor]:
+def _crossing_edges(table: _VoxelTable, axis: int) -> tuple[Tensor, Tensor]:
     """Grid edges along ``axis`` that cross the surface: their voxels (P, 3) in front of it and behind it."""
-    shape = (-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
-    distance = torch.where(_observed(volume, min_weight), volume.distance, torch.nan).view(shape)
-    dim = axis + 1
+    volume, dim = table.volume, axis + 1
     step = torch.nn.functional.one_hot(torch.tensor(axis, device=volume.key.device), 3)
-    slot, exists = sparse_grid.find_cells(
-        volume.key, sparse_grid.pack_cells(sparse_grid.unpack_cells(volume.key) + step)
-    )
-    beyond = distance.narrow(dim, 0, 1)[slot] if len(slot) else distance.narrow(dim, 0, 1)
-    beyond = torch.where(exists.view(-1, 1, 1, 1), beyond, torch.nan)
+    chosen = table.chosen.view(-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    distance = chosen[:-1]
+    beyond = chosen.narrow(dim, 0, 1)[table.beyond(axis)]
     next_distance = torch.cat((distance.narrow(dim, 1, BLOCK_SIDE - 1), beyond), dim)
     crossing = ((distance > 0) != (next_distance > 0)) & (
         (distance - next_distance).abs() <= _MAX_STEP_TRUNCATIONS * volume.truncation
@@ -192,22 +230,16 @@ def _crossing_edges(volume: Volume, axis: int, min_weight: float) -> tuple[Tenso
     return torch.where(front, low, high), torch.where(front, high, low)
 
 
-def _observed(volume: Volume, min_weight: float) -> Tensor:
-    total = volume.weight.sum(-1)
-    return (total > 0) & (total >= min_weight)
-
-
-def _dense_bricks(volume: Volume, min_weight: float):
+def _dense_bricks(table: _VoxelTable):
     """Dense bricks: origin (3,) in voxels, distance and observed (n, n, n), with one voxel of the next brick."""
-    block = sparse_grid.unpack_cells(volume.key)
-    brick = sparse_grid.pack_cells(block.div(_BRICK_BLOCKS, rounding_mode="floor"))
-    key = volume.key.cpu()
-    distance = volume.distance.cpu()
-    observed = _observed(volume, min_weight).cpu()
+    key = table.volume.key.cpu()
+    brick = sparse_grid.pack_cells(sparse_grid.unpack_cells(key).div(_BRICK_BLOCKS, rounding_mode="floor"))
+    distance = table.volume.distance.cpu()
+    observed = ~table.chosen[:-1].cpu().isnan()
     local = torch.cartesian_prod(*(torch.arange(_BRICK_BLOCKS + 1),) * 3)
     n = BLOCK_SIDE * _BRICK_BLOCKS + 1
     for number in brick.unique():
-        first = sparse_grid.unpack_cells(number.cpu()) * _BRICK_BLOCKS
+        first = sparse_grid.unpack_cells(number) * _BRICK_BLOCKS
         slot, exists = sparse_grid.find_cells(key, sparse_grid.pack_cells(first + local))
         dense = torch.ones(len(local), BLOCK_VOXELS)
         dense_observed = torch.zeros(len(local), BLOCK_VOXELS, dtype=torch.bool)
@@ -223,22 +255,18 @@ def _dense_bricks(volume: Volume, min_weight: float):
 
 def _meshable_cells(distance: Tensor, observed: Tensor, max_step: float) -> Tensor:
     """Cells (n - 1)³ of which every corner is observed and no edge is a rim."""
-    ok = torch.ones_like(observed[1:, 1:, 1:])
-    n = ok.shape[0]
-    corners = [slice(0, n), slice(1, n + 1)]
-    for x in corners:
-        for y in corners:
-            for z in corners:
-                ok &= observed[x, y, z]
+    ok = _both_ends(observed, 0, 1, 2)
     for dim in range(3):
-        steep = distance.diff(dim=dim).abs() > max_step
-        other_dims = [d for d in range(3) if d != dim]
-        for i in corners:
-            for k in corners:
-                index = [slice(None)] * 3
-                index[other_dims[0]], index[other_dims[1]] = i, k
-                ok &= ~steep[tuple(index)]
+        ok &= _both_ends(~(distance.diff(dim=dim).abs() > max_step), *({0, 1, 2} - {dim}))
     return ok
+
+
+def _both_ends(x: Tensor, *dims: int) -> Tensor:
+    """Mask of grid points -> mask of the steps between neighbours along ``dims``, True where both ends are."""
+    for dim in dims:
+        n = x.shape[dim] - 1
+        x = x.narrow(dim, 0, n) & x.narrow(dim, 1, n)
+    return x
 
 
 def _check_volume(min_weight: float) -> None:

@@ -35,8 +35,8 @@ WEIGHTINGS = ("variance", "confidence")
 
 @record
 class Volume(Record):
-    """Blocks of a signed distance field; made by :func:`make_volume`, grown by :func:`fuse_views`, never changed in
-    place."""
+    """Blocks of a signed distance field; made by :func:`make_volume`, grown by :func:`fuse_views`, changed in place
+    only where that is asked for."""
 
     key: Tensor  # (K,) int64, rising: packed positions of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
@@ -102,6 +102,7 @@ def fuse_views(
     max_reach: float = 3.0,
     carve: bool = True,
     weight: str = "variance",
+    in_place: bool = False,
 ) -> Volume:
     """The volume after fusion of B more views: the mean of all distances, weighted by 1/sigma² or by confidence.
 
@@ -118,6 +119,7 @@ def fuse_views(
         carve: False = voxels in front of the surface by more than the reach are unchanged.
         weight: ``variance``, 1/sigma²; ``confidence``, the last feature of a pixel, 0 to 1, over the squared side of a
             voxel, as of depths that are all equally precise: the sigma of the surface is then no standard deviation.
+        in_place: change ``volume`` where it has all blocks already, instead of a copy.
 
     Returns:
         Volume with the blocks that the views' surfaces pass through. Depths that are not finite, not positive or
@@ -138,7 +140,7 @@ def fuse_views(
         raise ValueError(f"weight: found {weight!r}, expected {' or '.join(WEIGHTINGS)}")
     with torch.no_grad():
         integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach, weight) for b in range(len(view.depth))]
-        volume = _grow(volume, [i.blocks() for i in integrators])
+        volume = _grow(volume, [i.blocks() for i in integrators], copy=not in_place)
         for integrator in integrators:
             integrator.add_to(volume, VOLUME_SOURCES.index(source), carve)
     return volume
@@ -291,34 +293,54 @@ class _ViewIntegrator:
         return ((z > -radius) & (z < farthest + radius) & in_field.all(-1)).nonzero()[:, 0]
 
     def _update(self, volume: Volume, part: Tensor, xyz: Tensor, source: int, carve: bool) -> None:
-        z = xyz[..., 2]
-        ahead = (z > 0.01) & (xyz[..., :2].abs() <= self.extent * z[..., None] * 1.01).all(-1)
-        uv = cameras.project(self.camera, xyz.flatten(0, 1)[None])[0].view(*z.shape, 2)
-        uv = round_half_up(uv)
-        ahead &= (uv >= 0).all(-1) & (uv[..., 0] < self.hw[1]) & (uv[..., 1] < self.hw[0])
-        pixel = torch.where(ahead, uv[..., 1] * self.hw[1] + uv[..., 0], 0.0).long()
-        depth, reach = self.depth[pixel], self.reach[pixel]
-        along = (depth - z) * xyz.norm(dim=-1) / z.clamp_min(0.01)
-        updated = ahead & (depth > 0) & (along > -reach)
+        """Update the voxels ``xyz`` (k, 512, 3) of blocks ``part``; those that the view leaves are not touched."""
+        pixel, along = self._observe(xyz)
+        updated = along > -self.reach[pixel]
         if not carve:
-            updated &= along <= reach
+            updated &= along <= self.reach[pixel]
+        updated = updated.flatten().nonzero()[:, 0]
+        pixel, along = pixel.flatten()[updated], along.flatten()[updated]
+        voxel = (part[:, None] * BLOCK_VOXELS + torch.arange(BLOCK_VOXELS, device=part.device)).flatten()[updated]
+        reach = self.reach[pixel]
         fade = (2 + 2 * along / reach).clamp(0, 1)
-        weight = torch.where(updated, self.precision[pixel] * fade, 0.0)
-        total = volume.weight[part].sum(-1) + weight
-        fraction = weight / torch.where(total > 0, total, 1.0)
-        old = volume.distance[part]
-        volume.distance[part] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
-        close = torch.where(along.abs() <= self.truncation, fraction, 0.0)[..., None]
-        colour = volume.features[part].to(fraction.dtype)
-        volume.features[part] = (colour + close * (self.features[pixel] - colour)).to(volume.features.dtype)
-        volume.weight[part, :, source] += weight
+        added = self.precision[pixel] * fade
+        weight, distance = volume.weight.view(-1, len(VOLUME_SOURCES)), volume.distance.view(-1)
+        old_weight, old = weight[voxel], distance[voxel]
+        total = old_weight.sum(-1) + added
+        fraction = added / torch.where(total > 0, total, 1.0)
+        distance[voxel] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
+        weight[:, source][voxel] = old_weight[:, source] + added
         if VOLUME_SOURCES[source] == Source.SWEPT:
-            volume.n_swept[part] += (updated & (along <= reach) & (fade >= 0.5) & (volume.n_swept[part] < 255)).byte()
+            n_swept = volume.n_swept.view(-1)
+            n_swept[voxel] += ((along <= reach) & (fade >= 0.5) & (n_swept[voxel] < 255)).byte()
+        close = along.abs() <= self.truncation
+        self._average_features(volume, voxel[close], pixel[close], fraction[close, None])
+
+    def _observe(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Voxels (…, 3) m in camera axes -> their pixels (…,), and how far in front of the surface they lie along the
+        ray, m; -inf where the view has no depth."""
+        x, y, z = xyz.unbind(-1)
+        in_field = (z > 0.01) & (x.abs() <= self.extent[0] * z * 1.01) & (y.abs() <= self.extent[1] * z * 1.01)
+        uv = cameras.project(self.camera, xyz.flatten(0, 1)[None])[0]
+        u, v = round_half_up(uv).view(*xyz.shape[:2], 2).unbind(-1)
+        in_field &= (u >= 0) & (v >= 0) & (u < self.hw[1]) & (v < self.hw[0])
+        pixel = torch.where(in_field, v * self.hw[1] + u, 0.0).long()
+        depth = self.depth[pixel]
+        along = (depth - z) * xyz.norm(dim=-1) / z.clamp_min(0.01)
+        return pixel, torch.where(in_field & (depth > 0), along, -torch.inf)
+
+    def _average_features(self, volume: Volume, voxel: Tensor, pixel: Tensor, fraction: Tensor) -> None:
+        """Move the features of voxels (P,) towards those of pixels (P,) by ``fraction`` (P, 1)."""
+        features = volume.features.flatten(0, 1)
+        old = features[voxel].to(fraction.dtype)
+        features[voxel] = (old + fraction * (self.features[pixel] - old)).to(features.dtype)
 
 
-def _grow(volume: Volume, keys: list[Tensor]) -> Volume:
-    """A copy of the volume with the blocks of ``keys`` added, empty."""
+def _grow(volume: Volume, keys: list[Tensor], copy: bool = True) -> Volume:
+    """A copy of the volume with the blocks of ``keys`` added, empty; without ``copy``, itself if no block is new."""
     key = torch.cat((volume.key, *keys)).unique()
+    if len(key) == len(volume.key) and not copy:
+        return volume
     index = sparse_grid.find_cells(key, volume.key)[0]
 
     def zero_padded(x: Tensor) -> Tensor:
