@@ -191,14 +191,14 @@ def against_dinov2(options: Any) -> list[dict[str, Any]]:
 
 def growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the time at 1440x1920 beside the own time at 224x224."""
-    rows = []
+    grown = []
     for mode in ("eager", "compiled", "torch.compile"):
         small, large = ([r for r in rows if r["name"] == f"frontend_{s}" and r["mode"] == mode] for s in SIZES)
         if small and large:
             a, b = large[0]["ours_ms"], small[0]["ours_ms"]
             more = {"ours_ms": a, "peer": "own_224", "peer_ms": b, "ratio": a / b, "peer_error": None, "bar": False}
-            rows.append({**large[0], **more})
-    return rows
+            grown.append({**large[0], **more})
+    return grown
 
 
 def main() -> None:

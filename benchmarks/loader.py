@@ -133,7 +133,7 @@ class Bench:
     """One image size and one kind of sample: the loaders that are compared, and their rows."""
 
     def __init__(self, size: str, mode: str, n: int, repeats: int, clock: str) -> None:
-        self.encoded, self.size, self.mode, self.n = encoded(), size, mode, n
+        (self.name, self.hw, self.pairs), self.size, self.mode, self.n = encoded(), size, mode, n
         self.repeats, self.clock = max(repeats // ROUNDS, 1), clock
         self.keys = ("image",) if mode == "single" else ("image", "other")
         self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
@@ -146,14 +146,12 @@ class Bench:
     def transform(self, **options: Any) -> ExtendDepth:
         """For the samples of this loader."""
         other = {"other_image": "other"} if self.mode == "pair" else {}
-        return ExtendDepth(
-            depth_unit="mm", intrinsics_hw=self.encoded[1], tokens_hw=(SIDE, SIDE), n=self.n, **other, **options
-        )
+        return ExtendDepth(depth_unit="mm", intrinsics_hw=self.hw, tokens_hw=(SIDE, SIDE), n=self.n, **other, **options)
 
     def encoded(self, workers: int, *, light: bool = False) -> Encoded:
         """Long enough for one turn."""
         length = BATCH * (STRETCH * (self.repeats + 1) + 2 * workers)
-        return Encoded(self.encoded[2], SIZES[self.size], self.keys, length, light)
+        return Encoded(self.pairs, SIZES[self.size], self.keys, length, light)
 
     def dataset(self, transform: ExtendDepth | None, workers: int) -> Encoded | ExtendedDataset:
         """What leaves the worker are small pictures and, with a transform, what it tells."""
@@ -241,7 +239,7 @@ def main() -> None:
     counts = options.workers or ([0, 1, 2, 4] if options.full else [0, 1, 2])
     modes = [(size, mode) for size in SIZES for mode in ("single", "pair")]
     benches = [Bench(*each, options.samples, options.repeats, options.clock) for each in modes]
-    print(f"pairs of {benches[0].encoded[0]}")
+    print(f"pairs of {benches[0].name}")
     rows = []
     for bench in benches:
         bench.measure(counts)

@@ -26,17 +26,17 @@ from dhtorch.pipeline.presets import METHODS
 STAGES = ("sample", "backproject", "classify", "track", "pose", "triangulate", "score")
 
 
-def seat_call(method: Method, stage: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
+def seat_call(method: Method, name: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
     """One stage of a method with the arguments that the method gives it."""
     seen: dict[str, Callable[[], Any]] = {}
-    stage = getattr(method, stage)
+    stage = getattr(method, name)
 
     def watched(*args: Any, **kwargs: Any) -> Any:
-        seen[stage] = partial(stage, *args, **kwargs)
+        seen[name] = partial(stage, *args, **kwargs)
         return stage(*args, **kwargs)
 
-    method.replace(n=n, **{stage: watched})(*frames)
-    return seen[stage]
+    method.replace(n=n, **{name: watched})(*frames)
+    return seen[name]
 
 
 def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
