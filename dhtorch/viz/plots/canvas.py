@@ -6,6 +6,7 @@ changes.
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 import re
 import warnings
@@ -25,6 +26,11 @@ LETTER_WIDTH_EM = 0.59
 _MIN_TITLE_SIZE_PT = 8.0
 #: Assumed letter width of bold titles, as a fraction of the font size.
 _BOLD_LETTER_WIDTH_EM = 0.66
+
+#: Padding around a saved figure, inches.
+_PADDING_IN = 0.1
+#: Kinds of files that matplotlib's Agg draws.
+_RASTER_KINDS = ("png", "jpg", "jpeg")
 
 CanvasPoint = tuple[float, float]
 
@@ -56,8 +62,10 @@ class Canvas:
         from matplotlib.transforms import Affine2D  # noqa: PLC0415
 
         self.figure = Figure((width / 72, height / 72), dpi=dpi)
+        self.figure.suppressComposite = True  # images side by side stay images of their own
         self._canvas_points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
         self.points = self._canvas_points
+        self._picture_axes: Any = None  # of all pictures: making axes takes longer than drawing an image
         self.tooltips: list[str] = []  # tooltips of the artists named tooltip-0, tooltip-1, …
 
     def set_origin(self, u: float, v: float) -> None:
@@ -144,8 +152,10 @@ class Canvas:
     def picture(self, pixels: Any, box: tuple[float, float, float, float]) -> None:
         """Draw an image, (H, W) grey or (H, W, 3) in [0, 1], below all else; ``box``: left, bottom, width, height."""
         (left, bottom, width, height), limits = box, 72 * self.figure.get_size_inches()
-        axes = self.axes()
-        axes.set_zorder(-1)
+        if self._picture_axes is None:
+            self._picture_axes = self.axes()
+            self._picture_axes.set_zorder(-1)
+        axes = self._picture_axes
         axes.imshow(
             pixels,
             cmap=GREY_CMAP,
@@ -221,13 +231,20 @@ def prefix_title(words: str, title: str) -> str:
 
 def save_figure(figure: Any, path: Any, kind: str = "png") -> None:
     """Write a figure, including artists outside its axes; ``kind`` is the format where ``path`` is an open file."""
+    is_open = not isinstance(path, str | pathlib.Path)
+    kind = kind if is_open else pathlib.Path(path).suffix[1:]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # glyphs missing in the font
-        if not isinstance(path, str | pathlib.Path):  # an open file
-            figure.savefig(path, bbox_inches="tight", pad_inches=0.1, format=kind)
-            return
-        with storage.replace_at_end(path) as unfinished:
-            figure.savefig(unfinished, bbox_inches="tight", pad_inches=0.1, format=pathlib.Path(path).suffix[1:])
+        box = _fit_box(figure) if kind in _RASTER_KINDS else "tight"
+        with contextlib.nullcontext(path) if is_open else storage.replace_at_end(path) as unfinished:
+            figure.savefig(unfinished, bbox_inches=box, pad_inches=_PADDING_IN, format=kind)
+
+
+def _fit_box(figure: Any) -> Any:
+    """Box of a figure's artists with padding, inches; as ``bbox_inches="tight"``, which draws the figure for it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+
+    return figure.get_tightbbox(FigureCanvasAgg(figure).get_renderer()).padded(_PADDING_IN)
 
 
 def _make_legend_handle(key: LegendKey) -> Any:
