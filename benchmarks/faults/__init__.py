@@ -5,6 +5,7 @@ answer. Rows come from what was once not noticed, and from what the rules of ``m
 """
 
 from faults import (
+    commanding,
     enriching,
     entry,
     front,
@@ -24,7 +25,7 @@ from faults.rows import Fault, faults
 
 PARTS = (
     *(geometry, solving, windows, front, kornia, joining, pose_priors),
-    *(sweeping, entry, enriching, judging, ruling, writing, reading),
+    *(sweeping, entry, enriching, judging, ruling, writing, reading, commanding),
 )
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]

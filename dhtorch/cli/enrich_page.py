@@ -106,11 +106,12 @@ def _build_page(about: Row, owns: Sequence[Row]) -> str:
 
 
 def _pixel_shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
-    pixels = np.sum([np.array(c["pixels"], float) for c in cameras if c["pixels"]], 0)
-    no_answer = np.sum([np.array(c["no_answer"], float) for c in cameras if c["pixels"]], 0)
-    total = max(1.0, float(np.sum(pixels)))
-    if not np.size(pixels):
+    readable = [c for c in cameras if c["pixels"]]
+    if not readable:
         return dict.fromkeys(_CODES_OF_KIND, 0.0) | {"no_answer": 1.0}, {}
+    pixels = np.sum([np.array(c["pixels"], float) for c in readable], 0)
+    no_answer = np.sum([np.array(c["no_answer"], float) for c in readable], 0)
+    total = max(1.0, float(np.sum(pixels)))
     kinds = {kind: float(sum(pixels[code] for code in codes)) / total for kind, codes in _CODES_OF_KIND.items()}
     gates = {name: float(no_answer[code]) / total for code, name in NO_ANSWER_REASONS.items() if code != Gate.ANSWER}
     return kinds, {

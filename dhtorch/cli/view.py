@@ -104,7 +104,7 @@ def _compute_exhibit(
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if not isinstance(settings["max_frames"], int) or settings["max_frames"] < 1:
-        raise ValueError(f"max_frames: found {settings['most']!r}, expected a whole number of at least 1")
+        raise ValueError(f"max_frames: found {settings['max_frames']!r}, expected a whole number of at least 1")
     common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
         "most": settings["max_frames"],

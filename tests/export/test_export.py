@@ -350,8 +350,8 @@ def test_a_frame_of_nerfstudio_has_its_lens_pose_and_centre():
 
 
 def test_depth_and_confidence_of_nerfstudio_are_steps_of_a_millimetre_and_a_share():
-    depth = np.array([[0.0, 0.0004, 0.0006, 1.2344, 65.534, 65.536]])
-    assert nerfstudio.quantise_nerfstudio_depth(depth).tolist() == [[0, 0, 1, 1234, 65534, 0]]
+    depth = np.array([[0.0, 0.0004, 0.0006, 1.2344, 65.534, 65.535, 65.536]])
+    assert nerfstudio.quantise_nerfstudio_depth(depth).tolist() == [[0, 0, 1, 1234, 65534, 0, 0]]
     sigma = np.array([[1.0, 0.1, 0.2, 0.0, 1000.0]])
     confidence = nerfstudio.encode_confidence(np.array([[0.0, 1.0, 2.0, 1.0, 1.0]]), sigma)
     assert confidence.tolist() == [[0, 128, 128, 255, 1]]
