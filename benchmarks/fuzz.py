@@ -1,4 +1,5 @@
-"""Hostile files of every format, each read by a child under the law of docs/data.md: time, memory, writes, code.
+"""Hostile files of every format and of every other input (depth maps, results, models, settings …), each read by a
+child under the law of docs/data.md: time, memory, writes, code.
 
     make fuzz                                            # some thousand seeded cases, within ten minutes
     python benchmarks/fuzz.py --full --json benchmarks/results/fuzz.json   # 20,000 and more
@@ -25,13 +26,17 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 from support import byte_damage, damage_harness, format_damage  # noqa: E402
-from support.captures_by_format import SAMPLES  # noqa: E402
+from support.captures_by_format import SAMPLES as CAPTURES  # noqa: E402
+from support.other_inputs import OTHER_INPUTS  # noqa: E402
 
 from dhtorch.data.io.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 from dhtorch.runtime import storage  # noqa: E402
 
+SAMPLES = CAPTURES | OTHER_INPUTS
 SOME, MANY = 150, 1000  # cases of every format
 SECONDS = 20  # of a processor
+#: Memory in bytes of an input that is no capture: its arrays may have any size that its files have.
+OTHER_BYTES = 2 << 30
 MINUTES = 9  # after which the seeded part stops, wherever it is
 
 
@@ -44,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--case", type=int, help="one case of it")
     parser.add_argument("--json", type=Path, help="write a summary")
     options = parser.parse_args(argv)
-    damage_harness.SECONDS, damage_harness.BYTES = SECONDS, MAX_MEMORY_BYTES
+    damage_harness.SECONDS = SECONDS
     names = [options.only] if options.only else list(SAMPLES)
     numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
     end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
@@ -57,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{total} cases, {len(failures)} failures")
     if options.json:
         law = {"name": "all", "cases": total, "failures": len(failures), "cpu_s": SECONDS, "bytes": MAX_MEMORY_BYTES}
+        law["bytes_of_other_inputs"] = OTHER_BYTES
         storage.write_json(
             options.json, [law | {"seed": options.seed}, *({"name": k} | v for k, v in outcomes.items())]
         )
@@ -66,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def attack(name: str, numbers: Sequence[int], seed: int, stop: float) -> dict[str, Any]:
     """Cases of one format by outcome, the worst of them, and what failed."""
     counts, failures = Counter[str](), list[str]()
+    damage_harness.BYTES = MAX_MEMORY_BYTES if name in CAPTURES else OTHER_BYTES
     slowest = largest = 0.0
     with (
         tempfile.TemporaryDirectory(prefix="dhtorch-fuzz-") as folder,

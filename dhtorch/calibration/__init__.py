@@ -15,6 +15,7 @@ from pathlib import Path
 from torch import Tensor
 
 from dhtorch.calibration.score_calibration import Calibration, parse_calibration
+from dhtorch.runtime import storage
 
 #: Required entries of a saved calibration's ``provenance``.
 _REQUIRED_PROVENANCE = ("method", "scenes")
@@ -40,7 +41,7 @@ def load_calibration(name: str | Path) -> Calibration:
         path = Path(__file__).parent / f"{name}.json"
     if not path.is_file():
         raise FileNotFoundError(f"{name}: found no calibration, expected a .json file or one of {list_calibrations()}")
-    return parse_calibration(path.read_text(encoding="utf-8"), path.name)
+    return parse_calibration(storage.read_text(path), path.name)
 
 
 def load_probability(name: str | Path) -> Callable[[Tensor], Tensor]:

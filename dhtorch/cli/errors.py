@@ -29,10 +29,10 @@ def format_error(error: BaseException) -> str:
     if isinstance(error, KeyError) and len(error.args) == 1:
         return str(error.args[0])
     return (
-        message if isinstance(error, USER_ERRORS) or _is_settings_error(error) else f"{type(error).__name__}: {message}"
+        message if isinstance(error, USER_ERRORS) or is_settings_error(error) else f"{type(error).__name__}: {message}"
     )
 
 
-def _is_settings_error(error: BaseException) -> bool:
-    """Whether the error is Hydra's or OmegaConf's, whose messages name the option."""
-    return type(error).__module__.startswith(("hydra.", "omegaconf."))
+def is_settings_error(error: BaseException) -> bool:
+    """Whether the error is Hydra's, OmegaConf's or YAML's, whose messages name the option or the file."""
+    return type(error).__module__.startswith(("hydra.", "omegaconf.", "yaml."))

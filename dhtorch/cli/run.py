@@ -118,6 +118,9 @@ _SEPARATORS = "/\\"
 #: End of a word that is the name of a file.
 _FILE_END = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")
 
+#: Groups of settings that become objects.
+_OBJECT_GROUPS = ("data", "method", "pairs", "experiment")
+
 #: Characters beyond which a folder name is cut and completed by a hash.
 _MAX_NAME_LENGTH = 120
 
@@ -145,6 +148,10 @@ def _run_guarded(argv: list[str]) -> int:
         console.discard_broken_pipe()
         return EXIT_BROKEN_PIPE
     except errors.USER_ERRORS as error:
+        return _report_failure(error, show="--traceback" in argv)
+    except Exception as error:
+        if not errors.is_settings_error(error):
+            raise
         return _report_failure(error, show="--traceback" in argv)
     except KeyboardInterrupt as stop:  # a sub-command may add how to continue
         print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
@@ -266,10 +273,7 @@ def job_name(overrides: str) -> str:
 
 def _run_configured(word: str, argv: list[str]) -> int:
     """Run a sub-command with Hydra overrides as one job in this process."""
-    import hydra  # noqa: PLC0415
-    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
-    from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
     typed = sorted(argv, key=lambda each: not _is_positional(each))
@@ -280,18 +284,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     words.validate_words(argv, ())
     argv = words.quote_words(argv)
     try:
-        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
-            defaults, argv = _check_overrides(word, argv)
-            cfg = hydra.compose(word, argv, return_hydra_config=True)
-            HydraConfig.instance().set_config(cfg)  # for settings that refer to Hydra's own, e.g. the folder name
-            groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
-        OmegaConf.set_struct(cfg, False)
-        del cfg["hydra"]
-        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        words.validate_values(settings, defaults)
-        _check_device(word, settings["device"])
-        function_options = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
-        parts = _instantiate_parts(cfg, function_options)
+        settings, parts, groups = compose_settings(word, argv)
     except (HydraException, OmegaConfBaseException) as error:
         return _report_failure(errors.unwrap_cause(error), show="traceback=true" in argv)
     module = importlib.import_module(_CONFIGURED_COMMANDS[word])
@@ -306,6 +299,33 @@ def _run_configured(word: str, argv: list[str]) -> int:
             return int(module.run(settings, parts, progress=console.progress) or EXIT_DONE)
     except errors.USER_ERRORS as error:
         return _report_failure(error, show=settings.get("traceback", False))
+
+
+def compose_settings(word: str, argv: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
+    """Settings of a sub-command -> resolved options, the objects of their groups, and the choice in each group.
+
+    Raises:
+        ValueError, OSError, KeyError, ImportError: unknown or wrong options.
+        HydraException, OmegaConfBaseException, YAMLError: settings that cannot be read, composed, resolved or made into
+            objects.
+    """
+    import hydra  # noqa: PLC0415
+    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        defaults, argv = _check_overrides(word, argv)
+        cfg = hydra.compose(word, argv, return_hydra_config=True)
+        HydraConfig.instance().set_config(cfg)  # for settings that refer to Hydra's own, e.g. the folder name
+        groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    words.validate_values(settings, defaults)
+    _check_objects(settings, groups)
+    _check_device(word, settings["device"])
+    function_options = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
+    return settings, _instantiate_parts(cfg, function_options), groups
 
 
 def _set_threads(threads: int | None) -> None:
@@ -590,8 +610,9 @@ def _run_job(cfg: Any) -> Any:
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         words.validate_values(settings)
+        _check_objects(settings, runtime.choices)
         _check_device("run", settings["device"])
-        parts = _instantiate_parts(cfg, ("data", "method", "pairs", "experiment"))
+        parts = _instantiate_parts(cfg, _OBJECT_GROUPS)
         if runtime.choices["experiment"] in _DEPTH_EXPERIMENTS:
             from dhtorch.cli.capture_checks import require_depth  # noqa: PLC0415
 
@@ -616,6 +637,15 @@ def _run_job(cfg: Any) -> Any:
     finally:
         if swept:
             together.mark_finished(sweep, name)
+
+
+def _check_objects(settings: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
+    """Raise ValueError for a chosen group of objects whose settings name none."""
+    for name in (name for name in _OBJECT_GROUPS if name in choices):
+        value = settings.get(name)
+        if not (isinstance(value, dict) and "_target_" in value):
+            problem = f"settings of {name}={choices[name]} without _target_"
+            raise ValueError(f"{name}: found {problem}, expected the name of what makes the {name}")
 
 
 def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:

@@ -81,7 +81,7 @@ class DepthMaps:
         """Warnings that the values of a few maps are no depth in the unit; of maps that are meant as metric depth."""
         frames = self.frames
         examined = sorted({frames[k * (len(frames) - 1) // (_N_EXAMINED_MAPS - 1)] for k in range(_N_EXAMINED_MAPS)})
-        findings = plausibility_findings([m[0] for i in examined if (m := self[i]) is not None], self.unit)
+        findings = plausibility_findings((m[0] for i in examined if (m := self[i]) is not None), self.unit)
         return [f"warning: maps: {text} ({remedy.removeprefix('data.')})" for _, text, remedy in findings]
 
     @property
@@ -118,7 +118,7 @@ class DepthMaps:
             array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
         _check_shape(file, array.shape, self.hw)
         stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
-        depth = clear_no_depth(stored * self.unit.metres, self.unit.metres)
+        depth = clear_no_depth(stored if self.unit.metres == 1 else stored * self.unit.metres, self.unit.metres)
         if (largest := float(depth.max())) > _MAX_DEPTH_M:
             raise FormatError(file, "depth", f"{largest:.4g} m", f"at most {_MAX_DEPTH_M:g} m; see depth_unit")
         return depth

@@ -6,7 +6,7 @@ is consistent with another room; poses and tracks show it, not the depth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import torch
@@ -71,7 +71,7 @@ class PlausibilityFinding(NamedTuple):
 
 
 def plausibility_findings(
-    depths: Sequence[Tensor],  # (h, w) m, 0 = no return
+    depths: Iterable[Tensor],  # (h, w) m, 0 = no return
     unit: DepthUnit | None,
     sparse: bool = False,
 ) -> list[PlausibilityFinding]:
@@ -80,7 +80,7 @@ def plausibility_findings(
     ``unit`` None: the format defines metres. A unit of 1 m, and None, mean that the values may be floats; any other
     that they were integers.
     """
-    maps = [_thin_rows(depth.detach().cpu().double()) for depth in depths if depth.numel()]
+    maps = [_thin_rows(depth.detach()).cpu().double() for depth in depths if depth.numel()]
     values = torch.cat([x[x > 0] for x in maps]) if maps else torch.zeros(0, dtype=torch.float64)
     if values.numel() < _MIN_VALUES:
         return []

@@ -26,6 +26,10 @@ _SHARED_METADATA_KEY = b"dhtorch"
 #: Key of the metadata of one shard.
 _SHARD_METADATA_KEY = b"dhtorch.shard"
 
+#: Fields of the shared metadata and of a shard's own that are read -> their types.
+_SHARED_FIELDS: dict[str, type] = {"key": str, "config": dict, "columns": dict, "data.digest": str}
+_SHARD_FIELDS: dict[str, type] = {"of": int, "counts": dict}
+
 #: Maximum rows of a row group, which is decoded as a whole: few, because a shuffled loader reads one row at a time.
 _MAX_GROUP_ROWS = 16
 
@@ -111,10 +115,9 @@ def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         shared, own = (storage.parse_strict_json(metadata[key].decode()) for key in keys)
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
-    for name, kind in {"key": str, "config": dict, "columns": dict, "data.digest": str}.items():
-        files.get_entry(shared, name, kind, path)
-    for name, kind in {"of": int, "counts": dict}.items():
-        files.get_entry(own, name, kind, path)
+    for value, fields in ((shared, _SHARED_FIELDS), (own, _SHARD_FIELDS)):
+        for name, kind in fields.items():
+            files.get_entry(value, name, kind, path)
     return shared, own
 
 

@@ -80,6 +80,19 @@ def parse_strict_json(text: str) -> Any:
     return value
 
 
+def read_text(path: str | Path) -> str:
+    """Text of a file in UTF-8.
+
+    Raises:
+        OSError: no such file, or one that cannot be read.
+        ValueError: bytes that are no UTF-8; the message names the file.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: found {error.reason} at byte {error.start}, expected text in UTF-8") from None
+
+
 def write_json(path: str | Path, value: Any) -> Path:
     """Write a value atomically as strict JSON, one line per member.
 

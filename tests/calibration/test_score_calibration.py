@@ -429,3 +429,10 @@ def test_a_recalibrated_stage_captures_maps_differentiates_and_keeps_to_itself(k
     assert torch.autograd.gradcheck(
         lambda s: out(torch.cat((s, sigma[:1, 4:]), 1)), (sigma[:1, :4].clone().requires_grad_(),)
     )
+
+
+def test_bytes_that_are_no_text_are_named(tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_bytes(b'{"schema": 1, "x": "\xff"}')
+    with pytest.raises(ValueError, match=r"mine\.json: found invalid start byte at byte 20, expected text in UTF-8"):
+        calibration.load_calibration(file)

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import re
+import shutil
 from types import SimpleNamespace
 
 import pytest
@@ -235,3 +236,19 @@ def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, 
     assert done == sorted(done) and seen[-1] == (2.0, 2, []), "the notes of two workers are one growing sum"
     assert any(0 < share < 2 for share in done), "it moves while they run"
     assert not (tmp_path / "sweep" / together._NOTES_FOLDER).exists()
+
+
+@pytest.mark.parametrize(
+    "content", ["n: [1, 2", "a: b: c", "\tn: 1", "n: 1\n  m: 2", "&a [*b]", "- 1\n- 2", "3", "", "%", "\x00"]
+)
+@pytest.mark.parametrize("command", ["complete", "run"])
+def test_settings_of_a_user_that_are_no_settings_are_one_line(tmp_path, monkeypatch, capsys, content, command):
+    shutil.copytree(run.config_dir(), tmp_path / "conf")
+    (tmp_path / "conf" / "method" / "mine.yaml").write_text(content)
+    monkeypatch.setattr(run, "config_dir", lambda: tmp_path / "conf")
+    monkeypatch.chdir(tmp_path)
+    words_typed = ["data=synthetic", "data.n_frames=2", "method=mine"]
+    assert run.main([command, *words_typed, *(["out=out"] if command == "complete" else [])]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "Traceback" not in message
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())

@@ -108,6 +108,53 @@ def test_a_damaged_model_is_one_line(tmp_path, kind, file, damage):
     assert "\n" not in str(error.value) and ": found " in str(error.value)
 
 
+def with_arrays(folder, **changes):
+    """The archive of a network's maps with other arrays."""
+    with np.load(folder / "predictions.npz") as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    np.savez(
+        folder / "predictions.npz", **{k: v(arrays[k]) if callable(v) else v for k, v in (arrays | changes).items()}
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"extrinsic": lambda x: 0 * x},
+        {"extrinsic": lambda x: x.reshape(-1)},
+        {"extrinsic": lambda x: x[:0]},
+        {"extrinsic": lambda x: np.nan * x},
+        {"extrinsic": np.zeros((0, 5000), np.uint8)},
+        {"intrinsic": lambda x: 0 * x},
+        {"intrinsic": np.float32(3)},
+        {"intrinsic": lambda x: -x},
+        {"depth": np.float32(3)},
+        {"depth": lambda x: x[:, :0]},
+        {"names": np.array([])},
+        {"names": np.array(["a"] * 3)},
+    ],
+    ids=str,
+)
+def test_arrays_of_other_shapes_and_numbers_are_one_line(tmp_path, changes):
+    _, folder = write(tmp_path, "npz")
+    with_arrays(folder, **{k: v if callable(v) else (lambda _, v=v: v) for k, v in changes.items()})
+    with pytest.raises(FormatError) as error:
+        read_model(folder)
+    assert "\n" not in str(error.value) and ": found " in str(error.value) and str(folder) in str(error.value)
+
+
+def test_points_that_are_no_places_are_left_out(tmp_path):
+    model, folder = write(tmp_path, "splat")
+    (file,) = folder.rglob("point_cloud.ply")
+    from dhtorch.viz.viewer.points import read_ply_vertices  # noqa: PLC0415
+
+    vertices = read_ply_vertices(file)
+    vertex = vertices.vertex.copy()
+    vertex["x"][:2], vertex["z"][3] = np.nan, np.inf
+    file.write_bytes(vertices.encode(vertex))
+    assert len(read_model(folder).xyz) == len(model.xyz) - 3
+
+
 def test_no_model_names_the_formats(tmp_path):
     with pytest.raises(FormatError, match="COLMAP"):
         read_model(tmp_path)

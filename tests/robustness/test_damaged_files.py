@@ -24,11 +24,14 @@ pytest.importorskip("pyarrow")
 
 from support import byte_damage as mutations
 from support import damage_harness as hostile
-from support.captures_by_format import SAMPLES, write_tum
+from support.captures_by_format import SAMPLES as CAPTURES
+from support.captures_by_format import write_tum
+from support.other_inputs import OTHER_INPUTS
 
 from dhtorch import data
 from dhtorch.data import FormatError
 
+SAMPLES = CAPTURES | OTHER_INPUTS
 MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
 
 

@@ -422,3 +422,9 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, change):
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"score\.json: found .* expected a learned score"):
         LearnedScore.read(path)
+
+
+def test_a_learned_score_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "score.json").write_bytes(b"\x93NUMPY")
+    with pytest.raises(ValueError, match=r"score\.json: found invalid start byte at byte 0, expected text in UTF-8"):
+        LearnedScore.read(tmp_path / "score.json")

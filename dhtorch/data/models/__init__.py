@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.models.colmap import find_colmap_model, read_colmap_model
@@ -26,8 +28,11 @@ def read_model(root: str | Path, *, images: str | Path | None = None) -> SceneMo
     Raises:
         FormatError: another format, a damaged file, a model without points and depth.
     """
-    root = Path(root)
-    pictures = None if images is None else Path(images)
+    return _checked(_read_format(Path(root), None if images is None else Path(images)))
+
+
+def _read_format(root: Path, pictures: Path | None) -> SceneModel:
+    """As :func:`read_model`, without the check."""
     if (model := find_colmap_model(root)) is not None:
         return read_colmap_model(*model, pictures)
     if (transforms := find_transforms(root)) is not None:
@@ -41,3 +46,21 @@ def read_model(root: str | Path, *, images: str | Path | None = None) -> SceneMo
         return read_splat_model(splats[-1], pictures)
     expected = "COLMAP's cameras, images and points3D (bin or txt), transforms.json, npz files of a network or a PLY"
     raise FormatError(root, "model", "none" if root.exists() else "no such file or folder", expected)
+
+
+def _checked(model: SceneModel) -> SceneModel:
+    """The model, after a check of its cameras, poses and points.
+
+    Raises:
+        FormatError: numbers that are not finite, a focal length or a size that is not positive.
+    """
+    if not bool(np.isfinite(model.xyz).all()):
+        raise FormatError(model.root, "points", "numbers that are not finite", "places of points")
+    for view in model.views:
+        numbers = np.concatenate([view.K.ravel(), view.c2w.ravel(), np.array(view.distortion or ())])
+        if not bool(np.isfinite(numbers).all()):
+            raise FormatError(model.root, f"view {view.name}", "numbers that are not finite", "a camera and a pose")
+        if not (bool((view.K.diagonal() > 0).all()) and min(view.hw) > 0):
+            size = f"focal lengths {view.K[0, 0]:g} and {view.K[1, 1]:g} px in {view.hw[1]}x{view.hw[0]}"
+            raise FormatError(model.root, f"view {view.name}", size, "a camera of some pixels")
+    return model

@@ -50,4 +50,4 @@ def read_nerfstudio_model(file: Path) -> SceneModel:
         storage.write_json(out / file.name, {**kept, "ply_file_path": cloud.name, "frames": frames})
         write_points(out / cloud.name, vertices, similarity)
 
-    return SceneModel(views, vertices.xyz, "nerfstudio", file, save)
+    return SceneModel(views, vertices.xyz[np.isfinite(vertices.xyz).all(1)], "nerfstudio", file, save)

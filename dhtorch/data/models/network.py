@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -64,9 +63,9 @@ def _names_of_arrays(
     if stored is not None:
         try:
             names = np.load(archive, allow_pickle=False)[stored]
-        except (ValueError, OSError, zipfile.BadZipFile) as error:
+        except Exception as error:  # numpy's parser and zlib: their exceptions are not specified
             raise FormatError(archive, stored, error, "an array of text") from None
-        return [str(name) for name in np.atleast_1d(names)]
+        return [str(name) for name in np.atleast_1d(names).ravel()]
     if n_archives > 1:
         return [archive.stem]
     folder = pictures if pictures is not None else (root if root.is_dir() else root.parent) / "images"
@@ -79,10 +78,13 @@ def _views_of_arrays(
 ) -> Iterator[ModelView]:
     """Views of an archive, whose arrays have a first axis of views or are those of one view."""
     pose = values["c2w"] if "c2w" in values else values["w2c"]
-    pose = pose.reshape(-1, *pose.shape[-2:])
-    n = len(pose)
     maps = values["depth"] if "depth" in values else values["points"]
     trailing = 3 if "depth" not in values else 1
+    for kind, array in (("pose", pose), ("depth or points", maps), ("K", values["K"])):
+        if array.ndim < 2 or array.size == 0:
+            raise FormatError(archive, kind, f"shape {array.shape}", "an array with numbers for every view")
+    pose = pose.reshape(-1, *pose.shape[-2:])
+    n = len(pose)
     maps = maps[..., None] if trailing == 1 and maps.shape[-1] != 1 else maps
     try:
         maps = maps.reshape(n, *maps.shape[-3:])
@@ -94,7 +96,7 @@ def _views_of_arrays(
         raise FormatError(archive, "shapes", error, f"the same number of views in all arrays, here {n}") from None
     if names is not None and len(names) != n:
         raise FormatError(archive, "names", f"{len(names)} names or pictures", f"one for each of {n} views")
-    c2w = full if "c2w" in values else np.linalg.inv(full)
+    c2w = full if "c2w" in values else _invert(archive, full)
     for k in range(n):
         z = maps[k, ..., 0]
         if trailing == 3:
@@ -105,6 +107,14 @@ def _views_of_arrays(
         name = f"{k:06d}" if names is None else names[k]
         image = name if isinstance(name, Path) else find_picture(archive.parent, Path(name).name, None)
         yield ModelView(Path(name).name, K[k], (z.shape[0], z.shape[1]), c2w[k], image=image, depth=z)
+
+
+def _invert(archive: Path, poses: np.ndarray) -> np.ndarray:
+    """Inverse of poses (n, 4, 4)."""
+    try:
+        return np.linalg.inv(poses)
+    except np.linalg.LinAlgError:
+        raise FormatError(archive, "poses", "a singular matrix", "rotations and translations") from None
 
 
 def _write_arrays(archive: Path, out: Path, similarity: Similarity) -> None:

@@ -53,4 +53,4 @@ def read_splat_model(file: Path, pictures: Path | None) -> SceneModel:
         entries = [{**entry, **place} for entry, place in zip(cameras, places, strict=True)]
         storage.replace_file(out / "cameras.json", (json.dumps(entries) + "\n").encode("utf-8"))
 
-    return SceneModel(views, xyz, "splat", file, save)
+    return SceneModel(views, xyz[np.isfinite(xyz).all(1)], "splat", file, save)
