@@ -56,10 +56,8 @@ class NerfstudioTarget:
         """As :meth:`DatasetTarget.own`."""
         files = [self._file(k, key) for key in self.views]
         try:
-            summaries = [
-                storage.parse_strict_json(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"]
-                for key in self.views
-            ]
+            contents = [storage.parse_strict_json(file.read_text(encoding="utf-8")) for file in files]
+            summaries = [content["dhtorch"] for content in contents]
             if any(summary["key"] != self.key for summary in summaries):
                 return None
         except (OSError, ValueError, KeyError, TypeError):

@@ -33,7 +33,6 @@ from dhtorch.extract.origin import SOURCE_CARD, DatasetSource, LeRobotSource
 from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
-from dhtorch.runtime.output_folder import is_whole
 
 #: Key of the metadata with the summary of an episode.
 _EPISODE_METADATA_KEY = b"dhtorch.episode"

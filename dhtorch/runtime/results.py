@@ -303,7 +303,9 @@ def check_same_run(file: Path, here: Mapping[str, Any], writer: str) -> None:
         difference = "" if there["key"] == here["key"] else describe_difference(there, here)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         problem = f"{type(error).__name__} {error}"
-        raise FileExistsError(f"{file}: found {problem}, expected a file written by dhtorch {writer}") from None
+        raise FileExistsError(
+            f"{file}: found {problem}, expected a file that dhtorch {writer} wrote; remove the folder or set another out"
+        ) from None
     if difference:
         raise FileExistsError(
             f"{file}: found files of another run ({difference}), expected the same settings or another out=DIR"
@@ -320,28 +322,6 @@ def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
         return "other data"
     versions = [meta.get("git") or meta.get("version") for meta in (there, here)]
     return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
-
-
-def check_same_run(file: Path, shared: Mapping[str, Any], what: str) -> None:
-    """Raise FileExistsError unless ``file``, the metadata of an output folder, has the key of ``shared``.
-
-    Args:
-        file: exists.
-        shared: metadata of this run.
-        what: the folder holds, for the message.
-    """
-    try:
-        existing = parse_strict_json(file.read_text(encoding="utf-8"))
-        is_same = existing["key"] == shared["key"]
-        difference = "" if is_same else describe_difference(existing, shared)
-    except (ValueError, KeyError, TypeError) as error:
-        raise FileExistsError(
-            f"{file}: found {error}, expected a file that this command wrote; remove the folder or set another out"
-        ) from None
-    if not is_same:
-        raise FileExistsError(
-            f"{file}: found {what} of another run ({difference}), expected the same settings or another out=DIR"
-        )
 
 
 def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int, operators: str) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from dhtorch.cli import run as commands
 from dhtorch.data.codecs.exr import read_exr
 from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.models import read_model
 from dhtorch.data.recording import Recording
 from dhtorch.experiments import report
 from dhtorch.export.frames import encode_png
@@ -39,7 +40,6 @@ from dhtorch.extract.features import FeatureTable
 from dhtorch.extract.origin import LeRobotSource
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.shards import find_finished_shards
-from dhtorch.measure.models import read_model
 from dhtorch.measure.pin import CameraPin
 from dhtorch.runtime import results as result_files
 from dhtorch.stages.score import LearnedScore

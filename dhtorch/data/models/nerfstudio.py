@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
