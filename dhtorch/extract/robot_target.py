@@ -33,6 +33,7 @@ from dhtorch.extract.origin import SOURCE_CARD, DatasetSource, LeRobotSource
 from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import is_whole
 
 #: Key of the metadata with the summary of an episode.
 _EPISODE_METADATA_KEY = b"dhtorch.episode"
@@ -189,7 +190,7 @@ class LeRobotTarget:
         try:
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
-            return summary if summary["key"] == self.key else None
+            return summary if summary["key"] == self.key and all(map(is_whole, self._geometry_files(k))) else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
 

@@ -304,7 +304,7 @@ def check_same_run(file: Path, here: Mapping[str, Any], writer: str) -> None:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         problem = f"{type(error).__name__} {error}"
         raise FileExistsError(
-            f"{file}: found {problem}, expected a file that dhtorch {writer} wrote; remove the folder or set another out"
+            f"{file}: found {problem}, expected a file written by dhtorch {writer}; remove the folder or set out=DIR"
         ) from None
     if difference:
         raise FileExistsError(
