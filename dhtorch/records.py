@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Cause, Gate, PoseCode, Source, State
+from dhtorch.codes import Cause, Gate, PinVerdict, PoseCode, Source, State
+from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.geometry.checks import all_finite
 from dhtorch.geometry.coarse_flow import CoarseFlow
@@ -371,6 +372,41 @@ class MergedDepth(Record):
     sigma: Tensor  # (B, N) m; 0 where neither source has depth
     score: Tensor  # (B, N) in [0, 1]: sensor confidence or selective score
     source: Tensor  # (B, N) int32, codes.Source
+
+
+@record
+class PinResult(Record):
+    """Offset of the camera from the reference for each of B pictures; NaN where it cannot be known."""
+
+    T_ref_from_live: Pose  # where the camera is now, in its axes at the reference (x right, y down, z forward), m
+    cov: Tensor  # (B, 6, 6) of the left perturbation (rotation rad, translation m); translation NaN if not metric
+    shift_px: Tensor  # (B,) median motion of the scene in the picture
+    shift_sigma_px: Tensor  # (B,) its standard deviation
+    distance: Tensor  # (B,) length of the offset in standard deviations, sway of a still camera included
+    verdict: Tensor  # (B,) int32, codes.PinVerdict
+    reason: Tensor  # (B,) int32, codes.PinReason
+    metric: Tensor  # (B,) bool: translation in metres; False: unit direction, or zero where none shows
+    flow_form: Tensor  # (B, 6, 6) mean square motion of the scene in the picture, px², as a form of the offset
+    inlier: Tensor  # (B, N) bool, places of the reference that agree with the motion
+    agreement: Tensor  # (B,) fraction of the tracks that agree
+    coverage: Tensor  # (B,) fraction of the reference's groups of places with agreeing tracks
+    false_alarm_rate: Tensor  # (B,) stated for "moved" of a camera that stands still
+
+    @property
+    def offset(self) -> Tensor:
+        """(B, 6) rotation vector, rad, and translation, m."""
+        T = self.T_ref_from_live
+        return torch.cat((se3.log(T)[:, :3], T.t), -1)
+
+    @property
+    def shift_low_px(self) -> Tensor:
+        """(B,) shift less two standard deviations, px, at least 0; NaN where it cannot be known."""
+        return (self.shift_px - 2 * self.shift_sigma_px).clamp_min(0)
+
+    @property
+    def moved(self) -> Tensor:
+        """(B,) bool: the verdict is *moved*."""
+        return self.verdict == PinVerdict.MOVED
 
 
 @record

@@ -524,6 +524,16 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
     "dhtorch.geometry.inference_mode.run_without_grad",
+    # tests/geometry/test_motion_fit.py, tests/geometry/test_epipolar_motion.py, tests/measure
+    *(f"dhtorch.geometry.motion_fit.{name}" for name in ("fit_motion", "mean_flow_form", "rotation_from_flow")),
+    *(f"dhtorch.geometry.{name}" for name in ("motion_fit.scene_flow", "epipolar_motion.fit_epipolar_motion")),
+    *(f"dhtorch.geometry.covariance.{name}" for name in ("chi2_quantile", "grouped_covariance")),
+    *(f"dhtorch.metrics.change_points.{name}" for name in ("mean_changes", "median_of_three")),
+    *(f"dhtorch.metrics.camera_paths.{name}" for name in ("align_camera_paths", "scale_of_camera_paths")),
+    *(
+        f"dhtorch.metrics.grouped.{name}"
+        for name in ("covariance_of_mean", "grouped_slopes", "huber_mean", "mad_sigma", "mean_over_stretches")
+    ),
     *(
         f"dhtorch.geometry.checks.{name}" for name in ("constant", "move_from_host")
     ),  # tests/pipeline/test_accelerator.py

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.cli.pin_words import describe_pin, guide_pin
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.codes import PinReason, PinVerdict, name
 from dhtorch.data import open_all
@@ -25,10 +26,10 @@ from dhtorch.data.intrinsics import MissingIntrinsicsError, parse_intrinsics
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.export import encode_png
-from dhtorch.measure.pin import CameraPin, PinResult
-from dhtorch.measure.pin_report import ChangePoint, describe_pin, find_change_points, guide_pin
+from dhtorch.measure.change_points import ChangePoint, find_change_points
+from dhtorch.measure.pin import CameraPin
 from dhtorch.pytree import collate
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Camera, Frame, PinResult
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder

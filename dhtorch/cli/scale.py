@@ -18,7 +18,8 @@ from dhtorch.data.models import Similarity, read_model, write_model
 from dhtorch.data.scene import scenes_of
 from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.measure.local_scales import REGIONS, ScaleTolerance
-from dhtorch.measure.scale import ScaleOptions, ScaleResult, metric_scale
+from dhtorch.measure.scale import ScaleResult, metric_scale
+from dhtorch.metrics.grouped import mad_sigma
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.plots import Panel, fit_axis, save_figure
@@ -49,14 +50,13 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
         raise ValueError(f"out: found the model's own folder {out}, expected another one")
     model = read_model(root, images=settings["images"])
     recording = scenes[0].recording
-    options = ScaleOptions(max_frames=settings["max_frames"], tolerance=ScaleTolerance(settings["tolerance"]))
-    with open_output_folder(out, "out") as folder:
-        folder.check(out / name for name in ("scale.json", "scale.html"))
-        result = metric_scale(model, recording, sensor=settings["sensor"], cutoff=settings["cutoff"], options=options)
-        if settings["frame"] == "capture" and result.R is None:
-            raise ValueError("frame: found capture, expected model: the capture has no poses for the matched views")
-        plain = Similarity(result.scale, np.eye(3), np.zeros(3))
-        similarity = plain if settings["frame"] == "model" else result.similarity
+    options = {key: settings[key] for key in ("sensor", "cutoff", "max_frames")}
+    result = metric_scale(model, recording, tolerance=ScaleTolerance(settings["tolerance"]), **options)
+    if settings["frame"] == "capture" and result.R is None:
+        raise ValueError("frame: found capture, expected model: the capture has no poses for the matched views")
+    plain = Similarity(result.scale, np.eye(3), np.zeros(3))
+    similarity = plain if settings["frame"] == "model" else result.similarity
+    with open_output_folder(out, "out"):
         if result.ok:
             write_model(model, out, similarity)
         content = {"model": str(root), "format": model.format, "capture": recording.name, **describe_scale(result)}
@@ -114,7 +114,7 @@ def _regions(result: ScaleResult) -> list[tuple[int, int, float, float]]:
     rows = []
     for region in np.unique(result.local.region):
         log = result.local.log[result.local.region == region] - np.log(result.scale)
-        sigma = 1.4826 * np.median(np.abs(log - np.median(log))) / np.sqrt(len(log))
+        sigma = mad_sigma(log) / np.sqrt(len(log))
         rows.append((*divmod(int(region), REGIONS[1]), float(np.expm1(np.median(log))), float(sigma)))
     return rows
 

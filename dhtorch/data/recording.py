@@ -15,7 +15,7 @@ from typing import ClassVar, TypeVar, overload
 import torch
 from torch import Tensor
 
-from dhtorch.data.io.safe_open import restrict_links
+from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.stored_sizes import StoredSizes, check_orientation
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import clear_no_depth
@@ -181,3 +181,17 @@ class Recordings(LazySequence[Recording]):
 def consecutive_frame_numbers(n: int) -> Tensor:
     """(n,) int64 0, 1, 2, …: the frame numbers of a capture without gaps."""
     return torch.arange(n, dtype=torch.int64)
+
+
+def picture_names(recording: Recording) -> list[str] | None:
+    """File names of the frames' pictures; None where frames are no picture files of their own."""
+    names = []
+    for i in range(len(recording)):
+        with record_opened_files() as opened:
+            _ = recording[i].image
+        pictures = [f for f in opened if f.suffix.lower() in (".png", ".jpg", ".jpeg")]
+        pictures = [f for f in pictures if not any(word in f.parent.name for word in ("depth", "conf"))]
+        if len(pictures) != 1:
+            return None
+        names.append(pictures[0].name)
+    return names

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.least_squares import solve_spd
+from dhtorch.geometry.least_squares import normal_equations, solve_spd
 from dhtorch.geometry.linalg import upper_triangle
 
 
@@ -41,6 +41,43 @@ def mahalanobis(
     check("mahalanobis", x=(x, "B n"), cov=(cov, "B n n"))
     whitened, _ = solve_spd(cov, x[..., None])
     return (x * whitened[..., 0]).sum(-1).clamp_min(0).sqrt()
+
+
+def grouped_covariance(
+    rows: Tensor,  # (B, n + 1, 2, N), of linearise: n columns of the Jacobian, then the residual
+    weight: Tensor,  # (B, N) ≥ 0
+    used: Tensor,  # (B, N) bool, points that count in a group
+    group: Tensor,  # (N,) long, from 0
+    sigma: Tensor,  # (B,) of one residual coordinate, px
+) -> Tensor:
+    """Covariance (B, n, n) of a weighted fit whose residuals are not independent within groups; 0 where singular.
+
+    The sandwich H⁻¹ (Σ s sᵀ · G / (G − n) + sigma² H) H⁻¹ over the scores s = Σ w Jᵀ r of G groups with points.
+
+    Gradient: to rows, weight and sigma. Raises ValueError for wrong shapes.
+    Source: K.-Y. Liang, S. Zeger, "Longitudinal data analysis using generalized linear models", 1986.
+    """
+    check("grouped_covariance", rows=(rows, "B n 2 N"), weight=(weight, "B N"), used=(used, "B N"), group=(group, "N"))
+    H, _ = normal_equations(rows, weight)
+    scores = (rows[:, :-1] * rows[:, -1:]).sum(2) * weight[:, None]  # (B, n, N)
+    n_groups = int(group.max()) + 1
+    sums = scores.new_zeros(*scores.shape[:2], n_groups).index_add_(2, group, scores)
+    count = scores.new_zeros(len(H), n_groups).index_add_(1, group, used.to(H.dtype))
+    n = (count > 0).sum(-1)[:, None, None]
+    meat = sums @ sums.mT * (n / (n - H.shape[-1]).clamp_min(1)) + H * (sigma * sigma)[:, None, None]
+    half, _ = solve_spd(H, meat)
+    return solve_spd(H, half.mT.contiguous())[0]
+
+
+def chi2_quantile(p: float, degrees: int) -> float:
+    """Quantile of a chi-squared distribution, by bisection. Gradient: none."""
+    low, high = 0.0, 1000.0
+    half = torch.tensor(degrees / 2, dtype=torch.float64)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = float(torch.special.gammainc(half, torch.tensor(middle / 2, dtype=torch.float64))) < p
+        low, high = (middle, high) if below else (low, middle)
+    return high
 
 
 def noise_shape(

@@ -13,24 +13,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Flag, PinReason, PinVerdict, first_reason
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3
+from dhtorch.geometry import motion_fit, se3
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.coarse_flow import coarse_flow
-from dhtorch.geometry.covariance import mahalanobis, masked_median
+from dhtorch.geometry.covariance import chi2_quantile, mahalanobis, masked_median
+from dhtorch.geometry.epipolar_motion import fit_epipolar_motion
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.least_squares import select_batch
+from dhtorch.geometry.motion_fit import MotionFit, Sightings
 from dhtorch.geometry.pyramid import PyramidCache
-from dhtorch.measure import pin_solve
+from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.pair import undistort_tracks, uniform_draws
 from dhtorch.pipeline.presets import AUTO, MAP_PYRAMID_LEVELS
-from dhtorch.pytree import Record, collate, record
-from dhtorch.records import MIN_TRACKABILITY, Camera, Frame, Pose, TrackHint, Tracks
+from dhtorch.pytree import collate
+from dhtorch.records import MIN_TRACKABILITY, Camera, Frame, PinResult, Pose, TrackHint, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
@@ -90,41 +94,6 @@ PIN_HYPOTHESES = 256
 MIN_BACKGROUND_SHARE = 0.4
 
 
-@record
-class PinResult(Record):
-    """Offset of the camera from the reference for each of B pictures; NaN where it cannot be known."""
-
-    T_ref_from_live: Pose  # where the camera is now, in its axes at the reference (x right, y down, z forward), m
-    cov: Tensor  # (B, 6, 6) of the left perturbation (rotation rad, translation m); translation NaN if not metric
-    shift_px: Tensor  # (B,) median motion of the scene in the picture
-    shift_sigma_px: Tensor  # (B,) its standard deviation
-    distance: Tensor  # (B,) length of the offset in standard deviations, sway of a still camera included
-    verdict: Tensor  # (B,) int32, codes.PinVerdict
-    reason: Tensor  # (B,) int32, codes.PinReason
-    metric: Tensor  # (B,) bool: translation in metres; False: unit direction, or zero where none shows
-    flow_form: Tensor  # (B, 6, 6) mean square motion of the scene in the picture, px², as a form of the offset
-    inlier: Tensor  # (B, N) bool, places of the reference that agree with the motion
-    agreement: Tensor  # (B,) fraction of the tracks that agree
-    coverage: Tensor  # (B,) fraction of the reference's groups of places with agreeing tracks
-    false_alarm_rate: Tensor  # (B,) stated for "moved" of a camera that stands still
-
-    @property
-    def offset(self) -> Tensor:
-        """(B, 6) rotation vector, rad, and translation, m."""
-        T = self.T_ref_from_live
-        return torch.cat((se3.log(T)[:, :3], T.t), -1)
-
-    @property
-    def shift_low_px(self) -> Tensor:
-        """(B,) shift less two standard deviations, px, at least 0; NaN where it cannot be known."""
-        return (self.shift_px - 2 * self.shift_sigma_px).clamp_min(0)
-
-    @property
-    def moved(self) -> Tensor:
-        """(B,) bool: the verdict is *moved*."""
-        return self.verdict == PinVerdict.MOVED
-
-
 class CameraPin:
     """A fixed camera's reference view, with which later pictures are compared.
 
@@ -134,6 +103,8 @@ class CameraPin:
             any the offset is not metric.
         false_alarm_rate: of the verdict *moved* for a camera that stands still.
         seed: of the pose search.
+
+    ``metric`` says whether the reference has enough depth for an offset in metres.
 
     Raises:
         ValueError: wrong shapes, a rate outside (0, 1), a reference without texture.
@@ -159,11 +130,6 @@ class CameraPin:
         if len(frames.image) > 1:
             self._use_capture(frames.detach())
 
-    @property
-    def metric(self) -> bool:
-        """Whether the reference has enough depth for an offset in metres."""
-        return self._metric
-
     @torch.no_grad()
     def check(self, image: Tensor, K: Tensor | Camera | None = None) -> PinResult:
         """Compare pictures with the reference.
@@ -183,15 +149,13 @@ class CameraPin:
         picture = grayscale(image).to(self.frame.camera.f)
         return collate(self._check_one(picture[b : b + 1], camera[b : b + 1]) for b in range(B))
 
-    # ------------------------------------------------------------------------------------------------------ reference
-
     def _set_reference(self, frame: Frame, background: Tensor | None) -> None:
         """Choose the places of the reference; ``background`` (N,) keeps only some of them."""
         self.frame = frame
         self.picture = grayscale(frame.image).to(frame.camera.f)
         self.pyramid = PyramidCache(self.picture)
         rows, columns, k = *PIN_GRID, PIN_CANDIDATES
-        uv = _lattice(frame.hw, rows * k, columns * k).to(frame.camera.f)
+        uv = map_pixel_centres(frame, (rows * k, columns * k))
         samples = AUTO.sample_depth_at(frame, uv)
         order = torch.arange(len(uv), device=uv.device).view(rows, k, columns, k).permute(0, 2, 1, 3).reshape(-1, k * k)
         best = samples.trackability[0][order].argmax(-1, keepdim=True)
@@ -201,16 +165,17 @@ class CameraPin:
         if not bool(textured.any()):
             raise ValueError("CameraPin: found a reference without texture, expected something to follow")
         near = textured & self.places.usable & ((self.places.flag & Flag.DEPTH_EDGE) == 0)
-        self._metric = int(near.sum()) >= MIN_METRIC_PLACES
-        self.known = near if self._metric else textured  # (1, N) places that are followed
+        self.metric = int(near.sum()) >= MIN_METRIC_PLACES
+        self.known = near if self.metric else textured  # (1, N) places that are followed
         self.ray = cam.rays(frame.camera, self.places.uv).double().mT.contiguous()
         xyz = torch.where(near[..., None], self.places.xyz, 1.0).double().mT.contiguous()
-        self.points = xyz if self._metric else self.ray  # (1, 3, N)
+        self.points = xyz if self.metric else self.ray  # (1, 3, N)
         f, c = frame.camera.f.double(), frame.camera.c.double()
-        self.flow_form = pin_solve.mean_flow_form(self.points, self.known, f, c)
+        self.flow_form = motion_fit.mean_flow_form(self.points, self.known, f, c)
         spacing = frame.hw[0] / rows, frame.hw[1] / columns
         self.overlap = max(1.0, PIN_WINDOW_PX / spacing[0]) * max(1.0, PIN_WINDOW_PX / spacing[1])
-        self.group = _cells(self.places.uv[0], frame.hw, PIN_GROUPS)
+        column, row = cam.resize_pixels(self.places.uv[0], frame.hw, PIN_GROUPS).round().long().unbind(-1)
+        self.group = row * PIN_GROUPS[1] + column
 
     def _use_capture(self, frames: Frame) -> None:
         """Leave out what moves between the frames; where the camera stood still, take the frames' median."""
@@ -218,17 +183,13 @@ class CameraPin:
         known = result.verdict != PinVerdict.CANNOT_KNOW
         if not bool(known.any()):
             self.notes.append("the frames of the reference do not agree: only the first is used")
-            return None
-        background = result.inlier[known].float().mean(0) >= MIN_BACKGROUND_SHARE
-        if bool(result.moved.any()):
+        elif bool(result.moved.any()):
             self.notes.append("the camera moves within the reference: its first frame is the reference")
-            return self._set_reference(self.frame, background)
-        depth = torch.where(frames.depth > 0, frames.depth, torch.nan).nanmedian(0, keepdim=True).values
-        image = frames.image.float().median(0, keepdim=True).values.to(frames.image.dtype)
-        self._set_reference(self.frame.replace(image=image, depth=depth.nan_to_num(0.0)), None)
-        return None
-
-    # ------------------------------------------------------------------------------------------------------- pictures
+            self._set_reference(self.frame, result.inlier[known].float().mean(0) >= MIN_BACKGROUND_SHARE)
+        else:
+            depth = torch.where(frames.depth > 0, frames.depth, torch.nan).nanmedian(0, keepdim=True).values
+            image = frames.image.float().median(0, keepdim=True).values.to(frames.image.dtype)
+            self._set_reference(self.frame.replace(image=image, depth=depth.nan_to_num(0.0)), None)
 
     def _live_camera(self, K: Tensor | Camera | None, B: int, hw: tuple[int, int]) -> Camera:
         if K is None:
@@ -240,60 +201,59 @@ class CameraPin:
 
     def _check_one(self, picture: Tensor, camera: Camera) -> PinResult:
         """The result (1) of one picture (1, 1, H, W)."""
-        hint = TrackHint(pyramid=self.pyramid)
-        places = int(self.known.sum())
-        tracks = _TRACKER(self.picture, picture, self.places.uv, hint=hint)
-        seen = self._see(tracks, camera)
-        fit = self._search(tracks, seen, camera)
-        if int(fit.inlier.sum()) < POOR_SHARE * places:  # from the motion of the whole picture
-            again = _TRACKER(self.picture, picture, self.places.uv, hint=hint, start=coarse_flow)
-            seen_again = self._see(again, camera)
-            fit_again = self._search(again, seen_again, camera)
-            if int(fit_again.inlier.sum()) > int(fit.inlier.sum()):
-                tracks, seen, fit = again, seen_again, fit_again
-        if int(fit.inlier.sum()) < ENOUGH_SHARE * places:  # the others from where the motion predicts them
+        n_places = int(self.known.sum())
+        tracks, seen, fit = self._search(picture, camera)
+        if int(fit.inlier.sum()) < POOR_SHARE * n_places:  # from the motion of the whole picture
+            again = self._search(picture, camera, start=coarse_flow)
+            if int(again[2].inlier.sum()) > int(fit.inlier.sum()):
+                tracks, seen, fit = again
+        if int(fit.inlier.sum()) < ENOUGH_SHARE * n_places:  # the others from where the motion predicts them
             start = cam.project(camera, se3.apply(fit.T, seen.xyz.mT).to(picture))
             wanted = (self.known & ~fit.inlier)[..., None]
             uv = torch.where(wanted, self.places.uv, -2.0 * max(self.frame.hw))  # a place outside costs nothing
-            retracked = _TRACKER(self.picture, picture, uv, hint=hint.replace(start=start, levels=PREDICTED_LEVELS))
-            tracks = _select_tracks(retracked, tracks)
-            seen = self._see(tracks, camera)
+            hint = TrackHint(pyramid=self.pyramid, start=start, levels=PREDICTED_LEVELS)
+            seen = self._see(_select_tracks(_TRACKER(self.picture, picture, uv, hint=hint), tracks), camera)
             fit = self._fit(seen, fit.T)
         return self._conclude(fit, seen)
 
-    def _see(self, tracks: Tracks, camera: Camera) -> pin_solve.Sightings:
+    def _see(self, tracks: Tracks, camera: Camera) -> Sightings:
         """Points of the reference with their ideal pixels in the picture."""
         tracks = undistort_tracks(tracks, self.frame.camera, camera)
         used = tracks.valid & self.known
         uv = torch.where(used[..., None], tracks.uv_1.double(), 0.0)
-        return pin_solve.Sightings(self.points, uv.mT.contiguous(), used, camera.f.double(), camera.c.double())
+        return Sightings(self.points, uv.mT.contiguous(), used, camera.f.double(), camera.c.double())
 
-    def _search(self, tracks: Tracks, seen: pin_solve.Sightings, camera: Camera) -> pin_solve.MotionFit:
-        """The motion of the tracks from a standstill, their median flow, and the best of random triples."""
+    def _search(self, picture: Tensor, camera: Camera, **options: Any) -> tuple[Tracks, Sightings, MotionFit]:
+        """Tracks, with options of the tracker, and their motion from a standstill, their median flow, and the best of
+        random triples."""
+        hint = TrackHint(pyramid=self.pyramid)
+        tracks = _TRACKER(self.picture, picture, self.places.uv, hint=hint, **options)
+        seen = self._see(tracks, camera)
         still = se3.identity(1, seen.f)
-        starts = [still, pin_solve.rotation_from_flow(seen, self.ray)]
-        if self._metric:
+        starts = [still, motion_fit.rotation_from_flow(seen, self.ray)]
+        if self.metric:
             draws = uniform_draws(self.seed, 1, PIN_HYPOTHESES).to(self.places.xyz)
             ideal = tracks.replace(uv_1=seen.uv.mT.to(tracks.uv_1), valid=seen.used)
             searched = pnp_ransac(self.places, ideal, cam.ideal(camera), cam.ideal(camera), draws)
             starts.append(select_batch(searched.ok, searched.T_1_from_0.map(lambda x: x.double()), still))
-        return self._fit(seen, collate(starts))
+        return tracks, seen, self._fit(seen, collate(starts))
 
-    def _fit(self, seen: pin_solve.Sightings, starts: Pose) -> pin_solve.MotionFit:
-        rotation_only = not self._metric
-        return pin_solve.fit_motion(seen, starts, self.group, overlap=self.overlap, rotation_only=rotation_only)
+    def _fit(self, seen: Sightings, starts: Pose) -> MotionFit:
+        rotation_only = not self.metric
+        return motion_fit.fit_motion(seen, starts, self.group, overlap=self.overlap, rotation_only=rotation_only)
 
-    def _conclude(self, fit: pin_solve.MotionFit, seen: pin_solve.Sightings) -> PinResult:
+    def _conclude(self, fit: MotionFit, seen: Sightings) -> PinResult:
         """The offset of a fit with its shift, and the verdict."""
         T, cov, used, inlier, noise = fit.T, fit.cov, seen.used, fit.inlier, fit.noise_px
-        shift, sigma = pin_solve.scene_flow(T, cov, seen.xyz, self.known, (seen.f, seen.c))
-        free = 6 if self._metric else 3
+        shift, sigma = motion_fit.scene_flow(T, cov, seen.xyz, self.known, (seen.f, seen.c))
+        free = 6 if self.metric else 3
         translates = torch.zeros_like(used[:, 0])
-        if self._metric:
+        if self.metric:
             scale = COMMON_DEPTH_ERROR * torch.cat((torch.zeros_like(T.t), T.t), -1)
             cov = cov + scale[:, :, None] * scale[:, None]
         else:
-            moving, epipolar, on_line = pin_solve.epipolar_motion(seen, T, noise)
+            live, bend = F.pad(seen.plane, (0, 0, 0, 1), value=1.0), motion_fit.FINAL_BEND * noise
+            moving, epipolar, on_line = fit_epipolar_motion(seen.xyz, live, used, T.R, seen.f.mean(-1), bend)
             translates = noise > MIN_PARALLAX_RATIO * epipolar.clamp_min(STILL_SWAY_PX)
             T = select_batch(translates, moving, T)
             flow = (seen.uv - (seen.xyz[:, :2] * seen.f[..., None] + seen.c[..., None])).norm(dim=1)
@@ -303,8 +263,8 @@ class CameraPin:
         sway = STILL_SWAY_PX**2 * torch.linalg.inv(self.flow_form[:, :free, :free])
         distance = mahalanobis(se3.log(fit.T)[:, :free], cov[:, :free, :free] + sway)
         limit = chi2_quantile(1 - self.false_alarm_rate, free) ** 0.5
-        n_group = int(self.group.max()) + 1
-        agreeing, placed = (_groups_hit(x, self.group, n_group) for x in (inlier, self.known))
+        groups = F.one_hot(self.group).float()  # (N, groups)
+        agreeing, placed = ((x.float() @ groups > 0).sum(-1) for x in (inlier, self.known))
         coverage = agreeing / placed.clamp_min(1)
         agreement = inlier.sum(-1) / used.sum(-1).clamp_min(1)
         reason = first_reason(
@@ -315,15 +275,13 @@ class CameraPin:
             (~(sigma <= MAX_PIN_SIGMA_PX), PinReason.UNCERTAIN),
         )
         answered = reason == PinReason.ANSWERED
-        moved = (distance > limit) | translates
-        verdict = torch.where(moved, PinVerdict.MOVED, PinVerdict.NOT_MOVED)
+        verdict = torch.where((distance > limit) | translates, PinVerdict.MOVED, PinVerdict.NOT_MOVED)
         verdict = torch.where(answered, verdict, PinVerdict.CANNOT_KNOW).int()
         T_ref = se3.invert(T)
         A = se3.adjoint(T_ref)
         cov = A @ cov @ A.mT
-        if not self._metric:
-            cov = torch.where(torch.arange(6, device=cov.device) < 3, cov, torch.nan)
-            cov = torch.where((torch.arange(6, device=cov.device) < 3)[:, None], cov, torch.nan)
+        if not self.metric:
+            cov = F.pad(cov[:, :3, :3], (0, 3, 0, 3), value=torch.nan)
 
         def answer(x: Tensor) -> Tensor:
             return torch.where(answered.view(-1, *[1] * (x.dim() - 1)), x, torch.nan)
@@ -336,7 +294,7 @@ class CameraPin:
             distance=answer(distance),
             verdict=verdict,
             reason=reason,
-            metric=torch.full_like(answered, self._metric),
+            metric=torch.full_like(answered, self.metric),
             flow_form=self.flow_form,
             inlier=inlier & answered[:, None],
             agreement=agreement,
@@ -355,32 +313,3 @@ def _select_tracks(first: Tracks, second: Tracks) -> Tracks:
     cov = torch.where(k[..., None], first.cov, second.cov)
     uv_1 = torch.where(k, first.uv_1, second.uv_1)
     return second.replace(uv_1=uv_1, cov=cov, valid=first.valid | second.valid)
-
-
-def chi2_quantile(p: float, degrees: int) -> float:
-    """Quantile of a chi-squared distribution, by bisection."""
-    low, high = 0.0, 1000.0
-    half = torch.tensor(degrees / 2, dtype=torch.float64)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        below = float(torch.special.gammainc(half, torch.tensor(middle / 2, dtype=torch.float64))) < p
-        low, high = (middle, high) if below else (low, middle)
-    return high
-
-
-def _lattice(hw: tuple[int, int], rows: int, columns: int) -> Tensor:
-    """Centres (rows * columns, 2) px of the cells of a picture, row by row."""
-    v, u = ((torch.arange(n) + 0.5) * (size / n) - 0.5 for n, size in ((rows, hw[0]), (columns, hw[1])))
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
-
-
-def _cells(uv: Tensor, hw: tuple[int, int], grid: tuple[int, int]) -> Tensor:
-    """Index (N,) of the cell of a grid over the picture in which each pixel lies."""
-    column = ((uv[:, 0] + 0.5) * (grid[1] / hw[1])).long().clamp(0, grid[1] - 1)
-    row = ((uv[:, 1] + 0.5) * (grid[0] / hw[0])).long().clamp(0, grid[0] - 1)
-    return row * grid[1] + column
-
-
-def _groups_hit(mask: Tensor, group: Tensor, n: int) -> Tensor:
-    """Number (B,) of groups with a place of the mask (B, N)."""
-    return (torch.zeros(len(mask), n, device=mask.device).index_add_(1, group, mask.float()) > 0).sum(-1)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import dhtorch
+from dhtorch.cli.pin_words import describe_pin, guide_pin
 from dhtorch.codes import PinReason, PinVerdict
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix
+from dhtorch.geometry.covariance import chi2_quantile
 from dhtorch.geometry.se3 import Pose
-from dhtorch.measure import pin_solve
-from dhtorch.measure.pin import CameraPin, PinResult, chi2_quantile
-from dhtorch.measure.pin_report import describe_pin, find_change_points, guide_pin
+from dhtorch.measure import CameraPin, PinResult, find_change_points
 from dhtorch.pytree import collate
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
@@ -108,22 +108,6 @@ def test_without_depth_the_rotation_is_known_and_the_translation_up_to_scale():
     length = float(moved.T_ref_from_live.t.norm())
     assert length == pytest.approx(1.0) or length == 0
     assert "no length" in describe_pin(still)
-
-
-def test_epipolar_motion_finds_direction_and_rotation():
-    draw = torch.Generator().manual_seed(0)
-    T = se3.exp(torch.tensor([[0.02, -0.01, 0.03, 0.08, -0.05, 0.06]], dtype=torch.float64))
-    ray = torch.cat((torch.rand(1, 2, 200, generator=draw) - 0.5, torch.ones(1, 1, 200)), 1).double()
-    Y = se3.apply(T, (ray * (1 + 2 * torch.rand(1, 1, 200, generator=draw).double())).mT).mT
-    f, c = torch.full((1, 2), 500.0, dtype=torch.float64), torch.full((1, 2), 320.0, dtype=torch.float64)
-    uv = Y[:, :2] / Y[:, 2:] * f[..., None] + c[..., None]
-    seen = pin_solve.Sightings(ray, uv, torch.ones(1, 200, dtype=torch.bool), f, c)
-    start = Pose(se3.exp(torch.tensor([[0.0, 0.06, 0.03, 0, 0, 0]], dtype=torch.float64)).R, torch.zeros(1, 3).double())
-    motion, noise, agreeing = pin_solve.epipolar_motion(seen, start, torch.ones(1, dtype=torch.float64))
-    direction = T.t / T.t.norm()
-    assert float((motion.t * direction).sum()) > 0.999 and float(noise) < 0.01
-    assert float(agreeing.double().mean()) > 0.95
-    assert float(se3.rotation_angle(motion.R @ T.R.mT)) < 1e-3
 
 
 def test_a_capture_as_reference_leaves_out_what_moves():

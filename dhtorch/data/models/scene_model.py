@@ -8,14 +8,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.geometry import camera as cam
+from dhtorch.records import Camera
 from dhtorch.runtime import storage
 from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
 
 #: Suffixes of pictures of a model, of which files may leave out theirs.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+#: A model point is seen in a picture unless another one is nearer by this fraction within a cell of so many cells
+#: across. Source: origin not recorded.
+_OCCLUSION_REL, _OCCLUSION_CELLS = 0.05, 48
 
 
 class Similarity(NamedTuple):
@@ -51,6 +59,26 @@ class ModelView:
     point: np.ndarray | None = None  # (n,) int64, indices of observed points; None = not stored
     uv: np.ndarray | None = None  # (n, 2) px, where they are observed
 
+    @property
+    def camera(self) -> Camera:
+        """(1) float64."""
+        lens = None if self.distortion is None else torch.tensor([self.distortion], dtype=torch.float64)
+        return cam.from_matrix(torch.from_numpy(np.array(self.K, np.float64))[None], lens)
+
+    def read_picture(self) -> Tensor:
+        """Picture (1, C, H, W) uint8.
+
+        Raises:
+            FormatError: none, or a damaged one.
+        """
+        if self.image is None:
+            raise FormatError(Path(self.name), "picture", "none", "the picture of the view")
+        return torch.from_numpy(files.read_image(self.image))[None]
+
+    def to_world(self, xyz: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the camera -> of the model."""
+        return xyz @ self.c2w[:3, :3].T + self.c2w[:3, 3]
+
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
@@ -61,6 +89,31 @@ class SceneModel:
     format: str = "memory"
     root: Path = Path()
     save: Callable[[Path, Similarity], None] | None = field(default=None, repr=False)
+
+    def seen_points(self, view: ModelView) -> tuple[Tensor, Tensor]:
+        """Pixels (n, 2) of a view, of K's size, and depths (n,) of the points observed there; where observations are
+        not stored, of all points inside the picture that no other one hides."""
+        xyz = self.xyz if view.point is None else self.xyz[view.point]
+        local = torch.from_numpy((xyz - view.c2w[:3, 3]) @ view.c2w[:3, :3])
+        z = local[:, 2]
+        if view.uv is None:
+            camera = view.camera
+            uv = cam.project(cam.ideal(camera), torch.where(z[:, None] > 0, local, 1.0)[None])
+            uv = cam.distort(camera, uv)[0]
+            keep = _unoccluded(uv, z, view.hw)
+        else:
+            uv, keep = torch.from_numpy(np.array(view.uv)), z > 0
+        return uv[keep].double(), z[keep].double()
+
+
+def _unoccluded(uv: Tensor, z: Tensor, hw: tuple[int, int]) -> Tensor:
+    """Points (N,) inside a picture that are not behind others in their cell."""
+    inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] <= hw[1] - 1) & (uv[:, 1] <= hw[0] - 1)
+    cell = (uv.nan_to_num(-1.0) / (max(hw) / _OCCLUSION_CELLS)).long()
+    key = torch.where(inside, cell[:, 1] * (_OCCLUSION_CELLS + 1) + cell[:, 0], 0).clamp_min(0)
+    nearest = torch.full((int(key.max()) + 1 if len(key) else 1,), torch.inf, dtype=z.dtype)
+    nearest.scatter_reduce_(0, key[inside], z[inside], "amin")
+    return inside & (z <= (1 + _OCCLUSION_REL) * nearest[key])
 
 
 def write_model(model: SceneModel, out: Path, similarity: Similarity) -> None:

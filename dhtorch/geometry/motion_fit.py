@@ -1,6 +1,6 @@
 """Robust fit of a small camera motion to tracks, with a covariance that neighbouring tracks do not shrink.
 
-Alphabet: T carries points of the reference into the live camera; xi = (rotation rad, translation m) its left
+Alphabet: T carries points of the reference into the other ("live") camera; xi = (rotation rad, translation m) its left
 perturbation. Everything is float64.
 """
 
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.covariance import masked_median
+from dhtorch.geometry.covariance import grouped_covariance, masked_median
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     linearise,
@@ -51,31 +51,20 @@ MODEL_SHARE = 0.65
 #: Median length of a residual of two Gaussian coordinates with unit sigma. Source: derived, sqrt(2 log 2).
 MEDIAN_RAYLEIGH = 1.1774
 
-#: Median absolute value of a Gaussian with unit sigma. Source: derived, the normal quantile of 3/4.
-MEDIAN_NORMAL = 0.6745
-
-#: Steps of the search for a direction of translation, a count. Source: chosen on built-in rooms of seeds 40 and 41.
-EPIPOLAR_STEPS = 15
-
-#: Bend of the robust kernel at the first of them, px, half as wide at each further one. Source: derived, twice the
-#: first of ``FIT_BENDS_PX``.
-EPIPOLAR_BEND_PX = 16.0
-
-#: Damping of these steps, a fraction of the trace. Source: origin not recorded.
-EPIPOLAR_DAMPING = 1e-9
-
-#: Least sine between a ray and the translation: nearer ones have no epipolar line. Source: derived, 3 degrees.
-MIN_SINE = 0.05
-
 
 class Sightings(NamedTuple):
-    """Points of the reference and where a live picture shows them."""
+    """Points of a reference view and where another picture shows them."""
 
     xyz: Tensor  # (B, 3, N) m in the reference camera; rays with z = 1 where there is no depth
-    uv: Tensor  # (B, 2, N) ideal px in the live picture
+    uv: Tensor  # (B, 2, N) ideal px in the picture
     used: Tensor  # (B, N) bool
-    f: Tensor  # (B, 2) px, of the live camera
+    f: Tensor  # (B, 2) px, of the picture's camera
     c: Tensor  # (B, 2) px
+
+    @property
+    def plane(self) -> Tensor:
+        """(B, 2, N) the pixels on the plane z = 1."""
+        return (self.uv - self.c[..., None]) / self.f[..., None]
 
 
 class MotionFit(NamedTuple):
@@ -115,9 +104,10 @@ def fit_motion(seen: Sightings, starts: Pose, group: Tensor, *, overlap: float, 
     square = rows[:, 6].square().sum(1)
     inlier = usable & (square < (AGREEING_SIGMAS * noise[:, None]) ** 2)
     _, weight = robust_loss(square / (FINAL_BEND * noise[:, None]) ** 2, "geman_mcclure", 1.0)
-    variance = MODEL_SHARE * overlap * noise * noise
-    cov = _covariance(rows, torch.where(usable, weight, 0.0), inlier, variance, group, rotation_only)
-    return MotionFit(T, cov, inlier, noise)
+    rows, sigma = _free(rows, rotation_only), noise * (MODEL_SHARE * overlap) ** 0.5
+    cov = grouped_covariance(rows, torch.where(usable, weight, 0.0), inlier, group, sigma)
+    zeros = (0, 6 - cov.shape[-1])
+    return MotionFit(T, F.pad(cov, zeros + zeros), inlier, noise)
 
 
 def _step(seen: Sightings, T: Pose, bend: Tensor | float, rotation_only: bool) -> tuple[Pose, Tensor]:
@@ -126,16 +116,14 @@ def _step(seen: Sightings, T: Pose, bend: Tensor | float, rotation_only: bool) -
     usable = seen.used & (depth > MIN_DEPTH)
     rho, weight = robust_loss(rows[:, 6].square().sum(1) / bend**2, "geman_mcclure", 1.0)
     cost = torch.where(usable, rho, 1.0).sum(-1)
-    H, g = normal_equations(rows, torch.where(usable, weight, 0.0))
-    return move_pose(T, _solve(H, -g[..., None], rotation_only)[..., 0]), cost
+    H, g = normal_equations(_free(rows, rotation_only), torch.where(usable, weight, 0.0))
+    xi = solve_spd(H, -g[..., None])[0][..., 0]
+    return move_pose(T, F.pad(xi, (0, 6 - xi.shape[-1]))), cost
 
 
-def _solve(H: Tensor, b: Tensor, rotation_only: bool) -> Tensor:
-    """H^-1 b (B, 6, k); zero where H is singular, and in the translation where only the rotation is free."""
-    if not rotation_only:
-        return solve_spd(H, b)[0]
-    x, _ = solve_spd(H[:, :3, :3], b[:, :3])
-    return torch.cat((x, torch.zeros_like(x)), 1)
+def _free(rows: Tensor, rotation_only: bool) -> Tensor:
+    """Rows of a linearisation without the columns of what stays as it is."""
+    return torch.cat((rows[:, :3], rows[:, 6:]), 1) if rotation_only else rows
 
 
 def _noise(r: Tensor, usable: Tensor) -> Tensor:
@@ -145,25 +133,9 @@ def _noise(r: Tensor, usable: Tensor) -> Tensor:
     return (median / MEDIAN_RAYLEIGH).clamp(*NOISE_RANGE_PX)
 
 
-def _covariance(
-    rows: Tensor, weight: Tensor, inlier: Tensor, variance: Tensor, group: Tensor, rotation_only: bool
-) -> Tensor:
-    """H^-1 M H^-1 (B, 6, 6): M sums the squared scores of groups and the model's of ``variance`` px²."""
-    H, _ = normal_equations(rows, weight)
-    scores = (rows[:, :6] * rows[:, 6:]).sum(2) * weight[:, None]  # (B, 6, N)
-    n_groups = int(group.max()) + 1
-    sums = scores.new_zeros(*scores.shape[:2], n_groups).index_add_(2, group, scores)
-    count = scores.new_zeros(len(H), n_groups).index_add_(1, group, inlier.to(H.dtype))
-    n, free = (count > 0).sum(-1)[:, None, None], 3 if rotation_only else 6
-    meat = sums @ sums.mT * (n / (n - free).clamp_min(1)) + H * variance[:, None, None]
-    half = _solve(H, meat, rotation_only)
-    return _solve(H, half.mT.contiguous(), rotation_only)
-
-
 def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:
     """Start (B): the rotation about two axes that moves the picture by the median flow from rays (B, 3, N), z = 1."""
-    ray_1 = (seen.uv - seen.c[..., None]) / seen.f[..., None]
-    x, y = (masked_median(ray_1[:, k] - ray_0[:, k], seen.used)[:, 0] for k in range(2))
+    x, y = (masked_median(seen.plane[:, k] - ray_0[:, k], seen.used)[:, 0] for k in range(2))
     has_tracks = seen.used.any(-1)
     turn = torch.stack((torch.where(has_tracks, -y, 0.0), torch.where(has_tracks, x, 0.0)), -1)
     return se3.exp(F.pad(turn, (0, 4)))
@@ -190,47 +162,3 @@ def mean_flow_form(xyz: Tensor, known: Tensor, f: Tensor, c: Tensor) -> Tensor:
     """Mean of J^T J (B, 6, 6) over known points (B, 3, N) seen from the reference: px² per squared unit of a motion."""
     rows, _ = linearise(se3.identity(len(f), f), f, c, xyz, torch.zeros_like(xyz[:, :2]))
     return normal_equations(rows, known.to(f.dtype))[0] / known.sum(-1).clamp_min(1)[:, None, None]
-
-
-def epipolar_motion(seen: Sightings, T: Pose, noise_px: Tensor) -> tuple[Pose, Tensor, Tensor]:
-    """Motion up to scale of tracks without depth, from the distances to epipolar lines.
-
-    Args:
-        seen: rays with z = 1 as points.
-        T, noise_px: the start, the pure rotation that fits best, and its noise (B,).
-
-    Returns:
-        The motion live from reference, |t| = 1, the noise (B,) of the distances, px, and the tracks (B, N) within it.
-    """
-    x = F.normalize(seen.xyz, dim=1)
-    y = torch.cat(((seen.uv - seen.c[..., None]) / seen.f[..., None], torch.ones_like(seen.uv[:, :1])), 1)
-    y = F.normalize(y, dim=1)
-    narrow, R = FINAL_BEND * noise_px[:, None], T.R
-    weight = seen.used.to(x.dtype)
-    b = R.mT @ y
-    a = torch.linalg.cross(x, b, dim=1)  # s . a = 0 for the direction s of the translation, in reference axes
-    s = torch.linalg.eigh((a * weight[:, None]) @ a.mT).eigenvectors[..., 0]  # of the smallest eigenvalue
-    distance = torch.zeros_like(weight)
-    for k in range(EPIPOLAR_STEPS):
-        bend = narrow.clamp_min(EPIPOLAR_BEND_PX / 2**k)
-        e = (s[:, None] @ a)[:, 0]
-        sine = torch.linalg.cross(s[..., None].expand_as(x), x, dim=1).norm(dim=1).clamp_min(MIN_SINE)
-        distance = seen.f.mean(-1)[:, None] * e / sine
-        _, robust = robust_loss((distance / bend).square(), "geman_mcclure", 1.0)
-        weight = torch.where(seen.used, robust / sine**2, 0.0)
-        tangent = torch.linalg.svd(s[:, None]).Vh[:, 1:]  # (B, 2, 3)
-        dot = (x * b).sum(1, keepdim=True)
-        J = torch.cat((x * (s[:, None] @ b) - s[..., None] * dot, tangent @ a), 1)
-        H = (J * weight[:, None]) @ J.mT
-        damping = EPIPOLAR_DAMPING * H.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] + 1e-300
-        H = H + damping * torch.eye(5, dtype=x.dtype, device=x.device)
-        step = torch.linalg.solve_ex(H, (J * (weight * e)[:, None]).sum(-1))[0]
-        R = R @ se3.exp(F.pad(-step[:, :3], (0, 3))).R
-        s = F.normalize(s - (step[:, None, 3:] @ tangent)[:, 0], dim=-1)
-        b = R.mT @ y
-        a = torch.linalg.cross(x, b, dim=1)
-    ahead = ((b - x * (x * b).sum(1, keepdim=True)) * s[..., None] * weight[:, None]).sum((1, 2))
-    s = torch.where(ahead[:, None] < 0, -s, s)  # points lie in front of both cameras
-    inside = seen.used & (distance.abs() < 3 * FIT_BENDS_PX[-1])
-    noise = masked_median(distance.abs(), inside)[:, 0] / MEDIAN_NORMAL
-    return Pose(R, (R @ s[..., None])[..., 0]), noise, inside & (distance.abs() < AGREEING_SIGMAS * noise[:, None])

@@ -1,0 +1,57 @@
+"""Changes of the mean of a series of vectors: binary segmentation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import check
+
+#: Fewest values before and after a change. Source: derived, two show a level, one an outlier.
+MIN_SEGMENT = 2
+
+
+def median_of_three(
+    x: Tensor,  # (k, n)
+) -> Tensor:
+    """Medians (k, n) of three neighbours: lasting changes stay, a single outlier disappears. Gradient: none."""
+    check("median_of_three", x=(x, "k n"))
+    middle = x.unfold(1, 3, 1).median(-1).values
+    return torch.cat([middle[:, :1], middle, middle[:, -1:]], 1)
+
+
+def mean_changes(
+    x: Tensor,  # (k, n)
+    limit: float,
+) -> list[tuple[int, int, int]]:
+    """Series of vectors with unit noise -> (low, place, high) of every change of the mean at ``place`` within [low,
+    high), by halving where the means on both sides differ most.
+
+    Args:
+        x: the series.
+        limit: squared difference in standard deviations that makes a change, e.g. a quantile of chi².
+
+    Gradient: none.
+    """
+    check("mean_changes", x=(x, "k n"))
+    changes, parts = [], [(0, x.shape[1])]
+    while parts:
+        low, high = parts.pop()
+        place, gain = _best_split(x[:, low:high])
+        if place is not None and gain > limit:
+            changes.append((low, low + place, high))
+            parts += [(low, low + place), (low + place, high)]
+    return sorted(changes, key=lambda change: change[1])
+
+
+def _best_split(x: Tensor) -> tuple[int | None, float]:
+    """Where the means of unit-noise series (free, n) differ most, and the squared length of that difference."""
+    n = x.shape[1]
+    if n < 2 * MIN_SEGMENT:
+        return None, 0.0
+    k = torch.arange(MIN_SEGMENT, n - MIN_SEGMENT + 1)
+    sums = x.cumsum(1)
+    left, right = sums[:, k - 1] / k, (sums[:, -1:] - sums[:, k - 1]) / (n - k)
+    gain = (right - left).square().sum(0) * (k * (n - k) / n)
+    best = int(gain.argmax())
+    return int(k[best]), float(gain[best])

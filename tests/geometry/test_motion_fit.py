@@ -1,0 +1,61 @@
+"""Robust fit of a small motion: exact for exact tracks, blind to outliers, honest where neighbours err together."""
+
+import torch
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.motion_fit import Sightings, fit_motion, mean_flow_form, rotation_from_flow, scene_flow
+from dhtorch.pytree import collate
+
+T = se3.exp(torch.tensor([[0.004, -0.006, 0.003, 0.01, -0.02, 0.015]], dtype=torch.float64))
+GROUP = torch.arange(400) // 10
+
+
+def sightings(seed=0, common_px=0.0, own_px=0.0, outliers=0):
+    draw = torch.Generator().manual_seed(seed)
+    ray = torch.cat((torch.rand(1, 2, 400, generator=draw) - 0.5, torch.ones(1, 1, 400)), 1).double()
+    xyz = ray * (1 + 2 * torch.rand(1, 1, 400, generator=draw).double())
+    f, c = torch.full((1, 2), 500.0, dtype=torch.float64), torch.full((1, 2), 320.0, dtype=torch.float64)
+    Y = se3.apply(T, xyz.mT).mT
+    uv = Y[:, :2] / Y[:, 2:] * f[..., None] + c[..., None]
+    uv = uv + common_px * torch.randn(1, 2, 40, generator=draw).double()[..., GROUP]
+    uv = uv + own_px * torch.randn(1, 2, 400, generator=draw).double()
+    uv[..., :outliers] += 20
+    return ray, Sightings(xyz, uv, torch.ones(1, 400, dtype=torch.bool), f, c)
+
+
+def fit(ray, seen, **options):
+    starts = collate([se3.identity(1, seen.f), rotation_from_flow(seen, ray)])
+    return fit_motion(seen, starts, GROUP, **{"overlap": 1.0, "rotation_only": False, **options})
+
+
+def test_an_exact_motion_is_found_among_outliers():
+    result = fit(*sightings(outliers=150))
+    error = se3.log(se3.compose(result.T, se3.invert(T)))
+    assert float(error.abs().max()) < 1e-6 and result.inlier[0].tolist() == [False] * 150 + [True] * 250
+
+
+def test_sigma_holds_where_neighbours_err_together():
+    """Ten tracks of a group share most of their error: a covariance of independent tracks would be three times less."""
+    errors = []
+    for seed in range(40):
+        result = fit(*sightings(seed, common_px=0.3, own_px=0.1))
+        error = se3.log(se3.compose(result.T, se3.invert(T)))
+        errors.append(error[0] / result.cov[0].diagonal().sqrt())
+    within = (torch.stack(errors).abs() < 1).double().mean()
+    assert 0.55 < float(within) < 0.85
+
+
+def test_only_the_rotation_is_free():
+    result = fit(*sightings(), rotation_only=True)
+    assert (
+        float(result.T.t.norm()) == 0 and bool((result.cov[:, 3:] == 0).all()) and bool((result.cov[:, 0, 0] > 0).all())
+    )
+
+
+def test_flow_of_a_motion_agrees_with_its_form_to_first_order():
+    _, seen = sightings()
+    small = se3.exp(torch.tensor([[1e-5, 2e-5, 0.0, 1e-5, 0.0, 0.0]], dtype=torch.float64))
+    shift, sigma = scene_flow(small, torch.zeros(1, 6, 6).double(), seen.xyz, seen.used, (seen.f, seen.c))
+    xi = se3.log(small)[0]
+    mean_square = float(xi @ mean_flow_form(seen.xyz, seen.used, seen.f, seen.c)[0] @ xi)
+    assert 0.5 < float(shift) / mean_square**0.5 < 1.5 and float(sigma) == 0
