@@ -19,7 +19,7 @@ from torch import Tensor
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, ransac
-from dhtorch.geometry.checks import all_finite, check, constant
+from dhtorch.geometry.checks import all_finite, any_possible, check, constant
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.map_estimate import MEDIAN_1D, MIN_NOISE_PX
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
@@ -159,17 +159,20 @@ def _is_misaligned(
 ) -> Tensor:
     """Whether (B,) there is a pose and the limits of :func:`reject_misaligned` reject it."""
     straight = _near_parallax(samples, tracks, fit, camera_0, camera_1)
+    n = straight.used.sum(-1)
+    is_exact = _pose_angle(fit, masked_median(straight.p, straight.used)) <= MAX_POSE_ANGLE
+    tested = fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+    if not any_possible(tested):
+        return tested
     rolling = straight
     if fit.shutter is not None:
         rolling = _near_parallax(samples, tracks, fit.replace(shutter=None), camera_0, camera_1)
-    n = straight.used.sum(-1)
     rejected = _unexplained_ratio(rolling) > max_unexplained + few_returns / n.clamp_min(1).sqrt()
     if fit.shutter is not None:
         rejected = rejected & (_unexplained_ratio(straight) > MIN_ROLLING_UNEXPLAINED)
     gain, n_shared = _attachment_gain(_thinned(straight), samples)
     rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
-    is_exact = _pose_angle(fit, masked_median(straight.p, straight.used)) <= MAX_POSE_ANGLE
-    return rejected & fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+    return rejected & tested
 
 
 def _pose_angle(fit: PoseFit, p: Tensor) -> Tensor:
@@ -221,27 +224,24 @@ def _thinned(near: _Parallax) -> _Parallax:
 
 def _profile_cost(near: _Parallax, p: Tensor, used: Tensor, scale: Tensor | None) -> Tensor:
     """Mean robust cost (…) of the residuals (q − s p) a of inverse depths p (…, N); s = 1, or fitted from ``scale``."""
-    square = _square(near, p if scale is None else scale * p)
+    square, variance = _square(near, p if scale is None else scale * p)
     if scale is not None:
+        a_squared = near.a**2
         for _ in range(SCALE_STEPS):
-            weight = near.a**2 / _variance(near, scale * p) * (COST_BEND**2 / (COST_BEND**2 + square)) ** 2
-            weight = torch.where(used, weight, 0.0)
-            total = (weight * p * p).sum(-1, keepdim=True)
-            fitted = (weight * p * near.q).sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+            weight = a_squared / variance * (COST_BEND**2 / (COST_BEND**2 + square)) ** 2
+            weight = torch.where(used, weight, 0.0) * p
+            total = (weight * p).sum(-1, keepdim=True)
+            fitted = (weight * near.q).sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
             scale = torch.where(fitted > 0, fitted, scale)
-            square = _square(near, scale * p)
+            square, variance = _square(near, scale * p)
     cost = torch.where(used, square / (COST_BEND**2 + square), 0.0)
     return cost.sum(-1) / used.sum(-1).clamp_min(1)
 
 
-def _variance(near: _Parallax, p: Tensor) -> Tensor:
-    """Variance px² of a residual along the epipolar line: track and sensor."""
-    return near.noise**2 + near.variance_rel * (p * near.a) ** 2
-
-
-def _square(near: _Parallax, p: Tensor) -> Tensor:
-    """Squared residual in variances."""
-    return ((near.q - p) * near.a) ** 2 / _variance(near, p)
+def _square(near: _Parallax, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared residual along the epipolar line in variances, and its variance px²: track and sensor."""
+    variance = near.noise**2 + near.variance_rel * (p * near.a) ** 2
+    return ((near.q - p) * near.a) ** 2 / variance, variance
 
 
 def _unexplained_ratio(near: _Parallax) -> Tensor:
