@@ -689,6 +689,7 @@ def main() -> int:
     parser.add_argument("modules", nargs="*", help="dotted names below dhtorch, or their beginnings; all of them")
     parser.add_argument("--sweep", type=float, default=0.0, help="draw this share of what the rules give instead")
     parser.add_argument("--seed", default="0", help="any text that the draw is to depend on, a commit for one")
+    parser.add_argument("--untried", action="store_true", help="leave out the faults that FILE of --json has a row of")
     parser.add_argument("--list", action="store_true", help="run nothing; print what is listed for every package")
     parser.add_argument(
         "--every", type=int, default=1, help="of each module's faults only every so many, the first too"
@@ -715,7 +716,9 @@ def main() -> int:
     KEYWORD[0] = args.keyword
     rows = []
     named = {module: [test for test in tests if test.startswith(args.among)] for module, tests in TESTS.items()}
-    faults = [fault for fault in faults if named[module_of(fault.module, known)]]
+    done = {(row["module"], row["function"], row["old"], row["new"]) for row in before if args.untried}
+    home = [(module_of(fault.module, known), fault) for fault in faults]
+    faults = [f for m, f in home if named.get(m) and (m, f.function, f.old, f.new) not in done]
     for row in run(faults, named, args.tests, args.jobs, args.quiet):
         rows.append(row)
         if args.json:  # at once: what was tried in an hour is not lost with the next

@@ -21,7 +21,7 @@ def test_every_fault_fits_the_code_once(module):
     source = KNOWN[mutants.module_of(module, KNOWN)].read_text()
     for fault in FAULTS:
         if fault.module == module:
-            mutants.placed(source, fault)
+            mutants.planted(source, fault)
             assert fault.old != fault.new, fault
 
 

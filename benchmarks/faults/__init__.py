@@ -13,6 +13,7 @@ from faults import (
     joining,
     judging,
     kornia,
+    mapping,
     pose_priors,
     reading,
     ruling,
@@ -25,7 +26,7 @@ from faults.rows import Fault, faults
 
 PARTS = (
     *(geometry, solving, windows, front, kornia, joining, pose_priors),
-    *(sweeping, entry, enriching, judging, ruling, writing, reading, commanding),
+    *(sweeping, entry, enriching, judging, ruling, writing, reading, commanding, mapping),
 )
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]

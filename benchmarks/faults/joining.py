@@ -170,7 +170,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Stream.push", "self.cuts.append(self.pushed)", "self.cuts.append(self.pushed + 1)"),
         ("Stream.push", "self.past.append(frame)", "self.past.appendleft(frame)"),
         ("is_scene_cut", "< MIN_CUT_SUPPORT", "> MIN_CUT_SUPPORT"),
-        ("is_scene_cut", "< FLAT", "< 0"),
+        ("is_scene_cut", "< FLAT_IMAGE_SIGMA", "< 0"),
         ("Stream.__init__", "maxlen=self.steps[-1]", "maxlen=None"),
         ("Stream.push", "Gate.NO_BASELINE", "Gate.ANSWER"),
     ],

@@ -25,7 +25,6 @@ TESTS: dict[str, list[str]] = {
     "validation.pose_check": ["tests/validation/test_pose_check.py"],
     "validation.edge_lag": ["tests/validation/test_edge_checks.py"],
     "validation.picture_field": ["tests/validation/test_capture_check.py"],
-    "records": ["tests/validation/test_pose_check.py"],
     "validation.edge_fault": ["tests/validation/test_edge_checks.py"],
     "validation.capture_check": ["tests/validation/test_capture_check.py"],
     "validation.wrong_causes": ["tests/validation/test_wrong_causes.py"],
@@ -233,9 +232,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("clear_lead", "mean if mean >", "mean if 1 + mean >"),
         ("find_edge_lag", "len(places) < _MIN_FRAMES", "len(places) < 1"),
         ("_shifted_scores", "edges = edges * mask", "edges = edges"),
-    ],
-    "records": [
-        ("Frame.map_camera", "return self.depth_camera", "return self.camera"),
     ],
     "validation.edge_fault": [
         ("find_edge_fault", "- without", ""),

@@ -110,7 +110,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_whitener", "(1 + square * linear", "(square * linear"),
         ("_whitener", "free = free & ~no_slope", "free = free"),
         ("_whitener", "if any_possible(no_slope)", "if False"),
-        ("_square", "(r * r).sum(1), BEHIND", "(r * r).sum(1), 0.0"),
+        ("_square", "(r * r).sum(1), BEHIND_CAMERA_RESIDUAL", "(r * r).sum(1), 0.0"),
         ("track_constants", "problem.ray[:, 1] / problem.ray[:, 2]", "problem.ray[:, 1]"),
         ("retract_unknowns", "at.shutter_rate + xi[:, 6:]", "at.shutter_rate - xi[:, 6:]"),
         ("retract_unknowns", "at.shutter_rate + xi[:, 6:]", "at.shutter_rate"),

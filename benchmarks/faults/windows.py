@@ -83,7 +83,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("_read_interleaved_patches", "div_(255 * 1000)", "div_(256 * 1000)"),
         ("_read_interleaved_patches", ".transpose(0, 1)", ""),
-        ("product_is_exact", "return _view_is_safe(image) and not reduced", "return _view_is_safe(image)"),
+        ("product_is_exact", "return _view_is_safe(image) and not reduced_precision", "return _view_is_safe(image)"),
         (
             "_view_is_safe",
             "image.requires_grad and torch.is_grad_enabled()",

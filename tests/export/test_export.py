@@ -328,6 +328,13 @@ def test_a_track_names_the_observation_of_its_point(tmp_path):
         for head, row in zip(lines["images.txt"][::2], lines["images.txt"][1::2], strict=True)
     }
     assert sorted(observed) == [1, 2] and [len(observed[k]) for k in (1, 2)] == [10, 10]
+    for image, rows in observed.items():
+        kept = [p for p in range(12) if p != 5 and seen[p, image - 1] >= 0]
+        written_uv = np.array([[float(u), float(v)] for u, v, _ in rows])
+        assert np.allclose(written_uv, uv[kept, image - 1].numpy() + 0.5, atol=1e-6)
+    (camera,) = [x for x in (tmp_path / "cameras.txt").read_text().split("\n")[:-1] if not x.startswith("#")]
+    assert camera.split() == ["1", "PINHOLE", "640", "480", "520", "510", "320", "231.75"]
+    assert [line.split()[8] for line in lines["images.txt"][::2]] == ["1", "1"]
     named = set()
     for line in lines["points3D.txt"]:
         number, track = line.split()[0], line.split()[8:]

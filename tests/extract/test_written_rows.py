@@ -17,6 +17,7 @@ import pyarrow.parquet as parquet
 
 from dhtorch.data.io.decode import decode_image
 from dhtorch.extract import plan
+from dhtorch.extract.engines import filter_rows
 from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, map_columns
 from dhtorch.extract.nerf_target import NerfstudioTarget
 from dhtorch.extract.robot_target import LeRobotTarget
@@ -26,10 +27,13 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
 
+#: Frames of a camera, more than a table takes at a time.
+M = 10
+
 SHARED = {"codes": {"problem": {str(k): str(k) for k in range(32)}}}
 
 
-def moving(first, name, n=4, **options):
+def moving(first, name, n=M, **options):
     """A scene of ``n`` frames with poses, times and pictures that no other frame of any camera has."""
     t = torch.stack([torch.tensor([0.1 * (first + i), 0.2, -0.01 * i]) for i in range(n)]).double()
     turns = torch.tensor([[0.0, 0.02 * (first + i), 0.0, 0.0, 0.0, 0.0] for i in range(n)], dtype=torch.float64)
@@ -50,10 +54,10 @@ def two_cameras(tmp_path_factory):
     answers = [rows[k] for k in range(len(rows))]
     assert not [row.complaint for row in answers if row.complaint]
     parts = {}
-    for key, first in zip(views, (0, 4), strict=True):
-        shard = plan.ShardSpec(first, 8, range(first, first + 4))
+    for key, first in zip(views, (0, M), strict=True):
+        shard = plan.ShardSpec(first, 8, range(first, first + M))
         write_shard(
-            folder, shard, ({**row.place, **row.features} for row in answers[first : first + 4]), wanted, SHARED
+            folder, shard, ({**row.place, **row.features} for row in answers[first : first + M]), wanted, SHARED
         )
         parts[key] = [folder / shard.name]
     return SimpleNamespace(scenes=scenes, views=views, rows=answers, parts=parts)
@@ -61,13 +65,13 @@ def two_cameras(tmp_path_factory):
 
 def test_a_row_is_that_of_its_own_frame(two_cameras):
     for n, row in enumerate(two_cameras.rows):
-        scene, i = two_cameras.scenes[n // 4], n % 4
+        scene, i = two_cameras.scenes[n // M], n % M
         recorded, columns = scene.recording, row.features
         assert row.place["recording"] == scene.name and row.place["frame_index"] == i
         assert row.place["timestamp"] == float(recorded.times[i])
         expected = se3.to_matrix(recorded.poses[i : i + 1])[0].flatten().numpy()
         assert np.array_equal(columns["pose"], expected)
-        own = frame(40 * (n // 4) + i)
+        own = frame(40 * (n // M) + i)
         assert np.allclose(columns["K"], cam.to_matrix(own.camera)[0].double().flatten())
         assert np.array_equal(decode_image(columns["picture"], "a row"), own.image[0].numpy())
 
@@ -81,25 +85,25 @@ def test_a_table_of_two_cameras_holds_what_each_of_them_saw_and_counts_on(two_ca
     target = lerobot(tmp_path, two_cameras.views)
     first = target.assemble(0, [], two_cameras.parts)
     second = target.assemble(1, [first], two_cameras.parts)
-    assert (first["start"], first["length"], second["start"], second["length"]) == (0, 4, 4, 4)
-    for k, start in enumerate((0, 4)):
+    assert (first["start"], first["length"], second["start"], second["length"]) == (0, M, M, M)
+    for k, start in enumerate((0, M)):
         table = parquet.read_table(target.file(k)).to_pydict()
-        assert table["index"] == list(range(start, start + 4)) and table["frame_index"] == list(range(4))
-        assert table["episode_index"] == [k] * 4 and table["task_index"] == [0] * 4
-        assert np.allclose(table["timestamp"], np.arange(4) / 5)
-        assert table["observation.time"] == [0.0, 0.25, 0.5, 0.75] and table["observation.frame_number"] == list(
-            range(4)
-        )
+        assert table["index"] == list(range(start, start + M)) and table["frame_index"] == list(range(M))
+        assert table["episode_index"] == [k] * M and table["task_index"] == [0] * M
+        assert np.allclose(table["timestamp"], np.arange(M) / 5)
+        assert table["observation.time"] == [0.25 * i for i in range(M)]
+        assert table["observation.frame_number"] == list(range(M))
         for n, name in enumerate(("left", "right")):
             images = [decode_image(cell["bytes"], "a cell") for cell in table[f"observation.images.{name}"]]
             for i, image in enumerate(images):
-                own = two_cameras.rows[4 * n + i].features
+                own = two_cameras.rows[M * n + i].features
                 assert np.array_equal(image, frame(40 * n + i).image[0].numpy()), (name, i)
                 assert np.array_equal(table[f"observation.{name}.T_world_from_cam"][i], own["pose"])
                 assert np.array_equal(table[f"observation.{name}.intrinsics"][i], own["K"])
 
 
-def test_a_frame_that_no_camera_could_read_takes_no_row(two_cameras, tmp_path):
+@pytest.mark.parametrize("on_error", ["flag", "skip"])
+def test_an_instant_with_an_unreadable_frame_takes_no_row(on_error, two_cameras, tmp_path):
     broken = [moving(0, "left", bad={1}), moving(40, "right")]
     views, wanted = two_cameras.views, map_columns(pictures=True, n=N)
     whole = plan.make_plan(broken, 1, 1, rigs=True)
@@ -107,16 +111,16 @@ def test_a_frame_that_no_camera_could_read_takes_no_row(two_cameras, tmp_path):
         broken, whole, wanted, method=Stub(answer=FixedEstimate(), n=N), gap=1, step=2**-10, views=views
     )
     parts = {}
-    for key, first in zip(views, (0, 4), strict=True):
-        read = [{**row.place, **row.features} for k in range(first, first + 4) if (row := rows[k]).features]
-        write_shard(tmp_path, plan.ShardSpec(first, 8, range(first, first + 4)), read, wanted, SHARED)
+    for key, first in zip(views, (0, M), strict=True):
+        read = list(filter_rows((rows[k] for k in range(first, first + M)), on_error, rows, [], "on_error"))
+        write_shard(tmp_path, plan.ShardSpec(first, 8, range(first, first + M)), read, wanted, SHARED)
         parts[key] = [tmp_path / plan.ShardSpec(first, 8, range(0)).name]
     target = lerobot(tmp_path / "out", views)
-    assert target.assemble(0, [], parts)["length"] == 3
+    assert target.assemble(0, [], parts)["length"] == M - 1
     table = parquet.read_table(target.file(0)).to_pydict()
-    assert table["observation.frame_number"] == [0, 2, 3] and table["frame_index"] == [0, 1, 2]
+    assert table["observation.frame_number"] == [0, *range(2, M)] and table["frame_index"] == list(range(M - 1))
     pictures = [decode_image(cell["bytes"], "a cell") for cell in table["observation.images.right"]]
-    for picture, i in zip(pictures, (0, 2, 3), strict=True):
+    for picture, i in zip(pictures, (0, *range(2, M)), strict=True):
         assert np.array_equal(picture, frame(40 + i).image[0].numpy())
 
 
@@ -126,7 +130,7 @@ def test_a_nerfstudio_folder_states_the_lens_and_the_pose_of_every_picture(two_c
     target = NerfstudioTarget(tmp_path, {key: replace(view, lens=lens)}, [{key: ""}], "k")
     target.assemble(0, [], two_cameras.parts)
     shots = json.loads((tmp_path / "transforms.json").read_text())["frames"]
-    assert [shot["timestamp"] for shot in shots] == [0.0, 0.25, 0.5, 0.75]
+    assert [shot["timestamp"] for shot in shots] == [0.25 * i for i in range(M)]
     for i, shot in enumerate(shots):
         own = two_cameras.rows[i].features
         assert tuple(shot.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")) == (lens or (0.0,) * 5)

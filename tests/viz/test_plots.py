@@ -19,8 +19,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from dhtorch.codes import Gate, Hole, Source, State, names
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.viz import plots as drawing
-from dhtorch.viz.plots import Axis, LayeredPicture, LegendKey, Panel, PointLayer, colours, notebook, render_inline_svg
+from dhtorch.viz.plots import (
+    Axis,
+    LayeredPicture,
+    LegendKey,
+    Panel,
+    PointLayer,
+    colours,
+    maps,
+    notebook,
+    previews,
+    render_inline_svg,
+)
+from dhtorch.viz.plots.axis import fit_axis
 from dhtorch.viz.viewer import html as pages
+from dhtorch.viz.viewer import points
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -272,3 +285,51 @@ def test_figures_of_all_notebooks_have_the_same_sizes():
         assert "rcParams |= notebook.NOTEBOOK_RC_PARAMS" in code, file.name
         widths = re.findall(r"figsize=\(([^,]*),", code)
         assert widths and all("notebook.FIGURE_WIDTH_IN" in width for width in widths), f"{file.name}: {widths}"
+
+
+def test_axes_place_values_and_have_round_ticks():
+    plain, log = Axis(2.0, 12.0), Axis(0.1, 10.0, log=True)
+    assert [plain.place(x) for x in (2.0, 7.0, 12.0, 99.0, -1.0)] == [0.0, 0.5, 1.0, 1.0, 0.0]
+    assert [log.place(x) for x in (0.1, 1.0, 10.0)] == pytest.approx([0.0, 0.5, 1.0])
+    assert plain.ticks(5) == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
+    assert {0.1, 1.0, 10.0} <= {round(t, 6) for t in log.ticks()}
+    fitted = fit_axis([1.0, None, 3.0], "x")
+    assert (fitted.low, fitted.high) == pytest.approx((0.88, 3.12))
+    assert fit_axis([1.0, -1.0, 4.0], "x", log=True).low == pytest.approx(1 / 1.15)
+    assert Axis(0, 1, percent=True).write(0.25) == "25"
+
+
+def test_colours_of_a_map_follow_the_log_of_its_values():
+    axis = Axis(1.0, 4.0, log=True)
+    values, there = np.array([[1.0, 2.0, 4.0, 9.0, 2.0]]), np.array([[True, True, True, True, False]])
+    shown = maps.apply_log_cmap(values, there, axis, colours.DEPTH_CMAP)
+    expected = maps.apply_cmap(np.array([[0.0, 0.5, 1.0, 1.0]]), colours.DEPTH_CMAP)
+    assert np.allclose(shown[:, :4], expected)
+    assert np.allclose(shown[0, 4], np.array(colours.parse_rgb(colours.PICTURE)) / 255)
+    depth_axis = maps.fit_depth_axis(np.linspace(1.0, 3.0, 1001))
+    assert (depth_axis.low, depth_axis.high) == pytest.approx((1.02, 2.98))
+    assert maps.fit_depth_axis(np.full(9, 2.0)).high == 2.5
+
+
+def test_previews_are_resampled_at_pixel_centres():
+    pixels = np.arange(12.0).reshape(3, 4, 1)
+    assert previews._resample(pixels, 3, 2)[..., 0].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
+    assert previews._resample(pixels, 6, 8)[::2, ::2, 0].tolist() == pixels[..., 0].tolist()
+
+
+def test_a_ply_file_is_shown_with_its_colours_and_up(tmp_path):
+    head = "ply\nformat ascii 1.0\ncomment up 0 0 1\nelement vertex 3\n"
+    head += "".join(f"property float {a}\n" for a in "xyz") + "property uchar red\nproperty uchar green\n"
+    path = tmp_path / "a.ply"
+    path.write_text(head + "property uchar blue\nend_header\n1 2 3 10 20 30\n4 5 6 40 50 60\nnan 0 0 0 0 0\n")
+    (shot,) = points.read_ply_exhibit(path).shots
+    assert shot.samples["rgb"].tolist() == [[10, 20, 30], [40, 50, 60]]
+    up = shot.samples["xyz"][1] - shot.samples["xyz"][0]
+    assert np.allclose(np.linalg.norm(up), np.sqrt(27), atol=1e-5)
+    assert np.allclose(shot.samples["xyz"][:, 1], [-3, -6], atol=1e-5), "up is against the camera's y"
+    vertices = points.read_ply_vertices(path)
+    assert np.allclose(vertices.xyz[:2], [[1, 2, 3], [4, 5, 6]])
+    moved = vertices.vertex.copy()
+    moved["x"] += 1
+    path.write_bytes(vertices.encode(moved))
+    assert np.allclose(points.read_ply_vertices(path).xyz[:2], [[2, 2, 3], [5, 5, 6]])
