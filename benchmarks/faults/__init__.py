@@ -6,6 +6,7 @@ answer. Rows come from what was once not noticed, and from what the rules of ``m
 
 from faults import (
     commanding,
+    compiled,
     enriching,
     entry,
     front,
@@ -26,7 +27,7 @@ from faults.rows import Fault, faults
 
 PARTS = (
     *(geometry, solving, windows, front, kornia, joining, pose_priors),
-    *(sweeping, entry, enriching, judging, ruling, writing, reading, commanding, mapping),
+    *(sweeping, entry, enriching, judging, ruling, writing, reading, commanding, mapping, compiled),
 )
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]

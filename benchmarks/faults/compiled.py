@@ -1,0 +1,84 @@
+"""Compiled operators; each is held against the torch function that it stands for."""
+
+FILE = "tests/ops/test_compiled.py"
+
+
+def _of(*names: str) -> list[str]:
+    return [f"{FILE}::test_{name}" for name in names]
+
+
+TESTS: dict[str, list[str]] = {
+    "ops.csrc.pose": _of("a_pose_from_near_points_agrees_up_to_rounding", "the_reasons_for_no_pose_agree"),
+    "ops.csrc.pyramid": _of("pyramids_agree_up_to_one_rounding"),
+    "ops.csrc.search": _of("a_search_for_points_agrees_up_to_rounding"),
+    "ops.csrc.sweep": _of(
+        "surfaces_and_rivals_are_equal",
+        "costs_are_equal_also_where_a_place_lies_behind_the_other_view",
+        "places_codes_and_smooth_maps_are_equal",
+    ),
+    "ops.csrc.tokens": _of("tokens_are_the_same_bits", "whole_depths_in_metres_are_the_same_bits"),
+    "ops.csrc.tracks": _of("equations_of_tracks_agree_up_to_rounding"),
+    "ops.csrc.windows": _of(
+        "numbers_about_windows_agree_textures_up_to_rounding",
+        "samples_and_holes_are_the_same_bits",
+        "pixels_are_the_same",
+    ),
+}
+
+FAULTS: dict[str, list[tuple[str, ...]]] = {
+    "ops.csrc.pose": [
+        ("outer_root", "return -third - std::copysign(s * size, q);", "return -third + std::copysign(s * size, q);"),
+        ("ranges", "d[i][k + 2] = pp * v[i] - s * p[i];", "d[i][k + 2] = pp * v[i] + s * p[i];"),
+        ("polish", "d[k] -= step[k]", "d[k] += step[k]"),
+        ("axes", "cross(normal, first, third);", "cross(first, normal, third);"),
+        ("p3p", "t -= R * X[0][c];", "t += R * X[0][c];"),
+        ("take", "from[4 * N + of[k]] - c[1]) / fy", "from[4 * N + of[k]] - c[1]) / fx"),
+    ],
+    "ops.csrc.pyramid": [
+        ("grey", "luma(unit(r[x]), unit(g[x]), unit(b[x]))", "luma(unit(b[x]), unit(g[x]), unit(r[x]))"),
+        ("half", "below.row(0, below.pad + 2 * y + k - 2)", "below.row(0, below.pad + 2 * y + k - 1)"),
+        ("mirror", "right[k] = right[-k];", "right[k] = right[0];"),
+        ("gradients", "g_x[pad + x] = across[x + 2] - across[x];", "g_x[pad + x] = across[x] - across[x + 2];"),
+        ("gradients", "slope[x] = under[x] - above[x];", "slope[x] = here[x] - above[x];"),
+        ("pyramid_level", "data<uint8_t>(source) + b * one", "data<uint8_t>(source)"),
+    ],
+    "ops.csrc.search": [
+        ("invert", "static_cast<float>(-b / det)", "static_cast<float>(b / det)"),
+        ("walk", "p[1] -= step[1];", "p[1] += step[1];"),
+        ("walk", "step[1] = found[1] / gain;", "step[1] = found[1];"),
+        ("interpolate", "(1.0f - std::abs(p[1] - static_cast<float>(i)))", "1.0f"),
+        ("put", "inverse[1] * a + inverse[2] * b", "inverse[1] * a + inverse[0] * b"),
+        ("project", "subtract(plane(k), inside.data(), mean);", "subtract(plane(0), inside.data(), mean);"),
+    ],
+    "ops.csrc.sweep": [
+        ("extend", "std::min(from[0], from[2])", "from[0]"),
+        ("choose", "0.5f * (before - after)", "0.5f * (after - before)"),
+        ("second_best", "at + reach + 1, D", "at + reach, D"),
+        ("second_best", "at - reach, 0", "at - reach + 1, 0"),
+        (
+            "census_transform",
+            "std::fill(to + margin + w, to + wide, row[w - 1]);",
+            "std::fill(to + margin + w, to + wide, row[0]);",
+        ),
+        ("find", "x % 2 == 0 && y % 2 == 0", "x % 2 == 0 || y % 2 == 0 ? x % 2 + y % 2 == 0 && x > 1 : false"),
+    ],
+    "ops.csrc.tokens": [
+        ("depth_code", "std::max(static_cast<float>(raw), 0.0f)", "static_cast<float>(raw)"),
+        ("over_unit", "depth_code(raw[k]) / unit", "depth_code(raw[k]) * unit"),
+    ],
+    "ops.csrc.tracks": [
+        ("equations", "H[j * n + i] = *from++", "H[i * n + j] = *from++"),
+        ("sums", "weight / (bent * bent)", "weight / bent"),
+        ("sums", "W * J[1][i]", "W * J[0][i]"),
+        ("sums", "J[i][j - 6] * at.height", "J[i][j - 6]"),
+        ("pair", "data<float>(seen) + 2 * N * k", "data<float>(seen)"),
+        ("squared_residuals", "data<bool>(front)[N * k + m + i]", "data<bool>(front)[N * k + i]"),
+    ],
+    "ops.csrc.windows": [
+        ("five_extremes", "least < low ? least : low", "least < low ? low : least"),
+        ("window_extremes", "*high++ = seen.most;", "*high++ = seen.least;"),
+        ("integer_grey", "LUMA_THOUSANDTHS[2] * at[2]", "LUMA_THOUSANDTHS[2] * at[1]"),
+        ("smaller", "return middle - (", "return middle + ("),
+        ("brightness_of", "least = std::min(least, middle[c]);", "least = std::max(least, middle[c]);"),
+    ],
+}
