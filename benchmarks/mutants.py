@@ -622,12 +622,13 @@ def row_of(module: str, fault: Fault, outcome: Tried) -> dict[str, Any]:
     return row | {"verdict": right if outcome.failed else wrong} | details
 
 
-def by_module(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
-    """Module, faults caught, how many change an answer, and how many change none; then the same of all."""
-    count = Counter((name, row["verdict"]) for row in rows for name in (row["module"], ALL))
+def by_module(rows: Sequence[dict[str, Any]], *, packages: bool = False) -> list[tuple[str, int, int, int]]:
+    """Module (or package), faults caught, how many change an answer, and how many change none; then the same of all."""
+    names = [package_of(row["module"]) if packages else row["module"] for row in rows]
+    count = Counter((each, row["verdict"]) for name, row in zip(names, rows, strict=True) for each in (name, ALL))
     return [
         (name, count[name, "caught"], count[name, "caught"] + count[name, "missed"], count[name, "equivalent"])
-        for name in [*sorted({row["module"] for row in rows}), ALL]
+        for name in [*sorted(set(names)), ALL]
     ]
 
 

@@ -665,7 +665,7 @@ def questions() -> str:
 
 def caught() -> str:
     """Planted faults that a test of their module caught, of those that change an answer."""
-    counts = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()))
+    counts = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()), packages=True)
     cells = [
         [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in counts
     ]

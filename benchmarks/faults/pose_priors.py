@@ -85,7 +85,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "_read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)",
             "_read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[0], at[0])",
         ),
-        ("read_pose_priors", "relative_covariance(world_1, *covs)", "relative_covariance(world_1, *covs[::-1])"),
+        (
+            "read_pose_priors",
+            "relative_covariance(world_1, *covs)",
+            "relative_covariance(world_1, *covs[::-1])",
+            "both covariances are moved into the same axes and added, in any order",
+        ),
         (
             "_read_matrix",
             "x[:, at if x.shape[1] > 1 else 0]",

@@ -490,3 +490,10 @@ def test_the_verdict_of_an_episode_is_that_of_most_known_pictures():
     assert episode([moved, moved, moved, still, unknown], zero).verdict == moved
     assert episode([moved, moved, unknown, unknown, unknown], zero).verdict == unknown
     assert episode([still] * 5, zero, changes=[3]).verdict == moved
+
+
+@pytest.mark.parametrize("value", [0, 2.5])
+def test_a_view_of_no_frames_is_refused(value):
+    options = {"scene": None, "dtype": "float32", "max_frames": value}
+    with pytest.raises(ValueError, match=f"max_frames: found {value}"):
+        view._compute_exhibit({"data": recording(2)}, options, lambda _: None, lambda items, *_: items)
