@@ -74,7 +74,8 @@ def write_rlds(
         root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [split_info]})
     )
     records = [
-        _encode_record(_encode_episode(frames, camera, depth_name, depth, intrinsics, poses)) for frames in episodes
+        _encode_record(_encode_episode(frames, camera, depth_name, depth, intrinsics, poses, number=k))
+        for k, frames in enumerate(episodes)
     ]
     for shard, count in enumerate(counts):
         name = f"tiny_robot-{split}.tfrecord-{shard:05d}-of-{shards:05d}"
@@ -82,13 +83,20 @@ def write_rlds(
 
 
 def _encode_episode(
-    frames: Sequence[Frame], camera: str, depth_name: str, depth: str | None, intrinsics: bool, poses: bool
+    frames: Sequence[Frame],
+    camera: str,
+    depth_name: str,
+    depth: str | None,
+    intrinsics: bool,
+    poses: bool,
+    *,
+    number: int,
 ) -> bytes:
-    """Message of one episode's record."""
+    """Message of one episode's record; actions differ from step to step and from episode to episode."""
     n = len(frames)
     features = {
         f"steps/observation/{camera}": _bytes_feature([encode_unfiltered_png(frame_to_hwc(frame)) for frame in frames]),
-        "steps/action": _floats_feature(np.arange(7 * n)),
+        "steps/action": _floats_feature(np.arange(7 * n) + 1000 * number),
         "steps/is_last": _int64s_feature([int(i == n - 1) for i in range(n)]),
         "episode_metadata/episode_id": _int64s_feature([-1]),
     }

@@ -1,0 +1,626 @@
+"""Every number that the commands and writers write, against the numbers of frames that are known, by other readers.
+
+The frames are those of ``support.known_episodes``, of which no two share a number. Files are read with pyarrow, PyAV,
+Pillow, json and struct, never with dhtorch's own readers.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+
+import av
+from PIL import Image
+from pyarrow import parquet
+from support import known_episodes as known
+from support.known_episodes import CAMERAS, FPS, HW, LENGTHS, LENS, TASKS
+
+from dhtorch import testing as writers
+from dhtorch.cli.run import main
+from dhtorch.codes import Gate, Hole, Source
+from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
+from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
+from dhtorch.viz.viewer import html
+from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud, SweptPointCloud
+
+KEYS = [f"observation.images.{name}" for name in CAMERAS]
+FEW = ["method=paper", "method.n=64", "method.hypotheses=10"]
+#: Without another view every depth is the sensor's, so that the maps are known, too.
+ENRICH = [*FEW, "gap=0", "dense={size: 64, planes: 8}", "shard_rows=4", "report=false"]
+#: Quantisation of enrich's depth and sigma, m, and the sensor's relative standard deviation.
+STEP, SIGMA_STEP, SIGMA_REL = 2.0**-10, 2.0**-13, 0.01
+
+Array = np.ndarray
+
+
+def enrich(source: Path, out: Path, *more: str) -> Path:
+    assert main(["enrich", str(source), str(out), *ENRICH, *more]) == 0
+    return out
+
+
+def stored_depth(camera: int, e: int, i: int) -> Array:
+    """The sensor's depth in steps of enrich, m."""
+    return np.rint(known.depth(camera, e, i).astype(np.float64) / STEP) * STEP
+
+
+def stored_sigma(camera: int, e: int, i: int) -> Array:
+    z = known.depth(camera, e, i).astype(np.float64)
+    return np.rint(SIGMA_REL * z / SIGMA_STEP) * SIGMA_STEP
+
+
+def pixels(content: Path | bytes) -> Array:
+    return np.array(Image.open(io.BytesIO(content) if isinstance(content, bytes) else content))
+
+
+def read_rows(root: Path) -> list[dict[str, Any]]:
+    return [row for file in sorted((root / "data").rglob("*.parquet")) for row in parquet.read_table(file).to_pylist()]
+
+
+def read_json(*parts: Path | str) -> Any:
+    return json.loads(Path(*parts).read_text())
+
+
+def read_lines(file: Path) -> list[Any]:
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def video(file: Path) -> Array:
+    with av.open(str(file)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def same(value: Any, want: Any, tolerance: float = 0.0) -> None:
+    np.testing.assert_allclose(np.asarray(value, np.float64), np.asarray(want, np.float64), rtol=0, atol=tolerance)
+
+
+# --------------------------------------------------------------------------------------------------- enrich, LeRobot
+
+
+def check_maps(row: dict[str, Any], camera: int, e: int, i: int, depth_key: str) -> None:
+    """Depth, sigma, source, K and pose of one camera in one row."""
+    key = depth_key.removesuffix("_enriched").removesuffix("_depth")
+    name = key.removeprefix("observation.images.")
+    has_return = known.depth(camera, e, i) > 0
+    same(row[depth_key], stored_depth(camera, e, i)[None])
+    same(row[f"{depth_key}_sigma"], stored_sigma(camera, e, i)[None], SIGMA_STEP)  # on the edge of two steps
+    same(row[f"{key}_dhtorch_source"], np.where(has_return, Source.SENSOR, Source.NONE)[None])
+    same(np.reshape(row[f"observation.{name}.intrinsics"], (3, 3)), known.intrinsics(camera, e, i))
+    same(np.reshape(row[f"observation.{name}.T_world_from_cam"], (4, 4)), known.pose(camera, e, i), 1e-7)
+
+
+@pytest.fixture(scope="module", params=[3, 2])
+def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
+    """Version of the format, and the known set enriched in it."""
+    root = tmp_path_factory.mktemp("robot")
+    known.write_robot(root / "source", version=request.param)
+    return request.param, enrich(root / "source", root / "set", "format=same")
+
+
+def test_every_row_of_a_robots_set_has_its_own_numbers(robot: tuple[int, Path]) -> None:
+    rows = read_rows(robot[1])
+    assert len(rows) == sum(LENGTHS)
+    for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
+        assert (row["index"], row["episode_index"], row["frame_index"]) == (index, e, i)
+        assert row["timestamp"] == np.float32(i / FPS) and row["task_index"] == known.task(e, i)
+        assert row["note"] == f"step {i} of {e}"
+        same(row["observation.state"], known.joints(e, i))
+        same(row["action"], known.action(e, i))
+        for camera, key in enumerate(KEYS):
+            check_maps(row, camera, e, i, f"{key}_depth_enriched")
+            same(row[f"{key}_depth"], known.depth(camera, e, i)[None])
+            same(np.reshape(row[f"{key}.intrinsics"], (3, 3)), known.intrinsics(camera, e, i))
+            same(np.reshape(row[f"{key}.pose"], (4, 4)), known.pose(camera, e, i), 1e-9)
+
+
+def test_the_metadata_lead_to_the_rows_and_video_frames_of_every_episode(robot: tuple[int, Path]) -> None:
+    version, root = robot
+    info = read_json(root, "meta", "info.json")
+    tasks = [list(dict.fromkeys(TASKS[known.task(e, i)] for i in range(n))) for e, n in enumerate(LENGTHS)]
+    totals = {"total_episodes": len(LENGTHS), "total_frames": sum(LENGTHS), "total_tasks": len(TASKS), "fps": FPS}
+    assert {name: info[name] for name in totals} == totals
+    assert info["splits"] == {"train": "0:1", "val": "1:2"} and info["robot_type"] == "known arm"
+    if version == 2:
+        found = [
+            (row["episode_index"], row["length"], row["tasks"]) for row in read_lines(root / "meta/episodes.jsonl")
+        ]
+        task_rows = read_lines(root / "meta" / "tasks.jsonl")
+    else:
+        (file,) = (root / "meta" / "episodes").rglob("*.parquet")
+        episodes = parquet.read_table(file).to_pylist()
+        found = [(row["episode_index"], row["length"], row["tasks"]) for row in episodes]
+        spans = [(row["dataset_from_index"], row["dataset_to_index"]) for row in episodes]
+        assert spans == [(0, LENGTHS[0]), (LENGTHS[0], sum(LENGTHS))]
+        task_rows = parquet.read_table(root / "meta" / "tasks.parquet").to_pylist()
+    assert found == [(e, n, tasks[e]) for e, n in enumerate(LENGTHS)]
+    assert [(row["task_index"], row["task"]) for row in task_rows] == list(enumerate(TASKS))
+    for camera, key in enumerate(KEYS):
+        for e, n in enumerate(LENGTHS):
+            where = {"video_key": key, "episode_index": e, "episode_chunk": 0, "chunk_index": 0, "file_index": 0}
+            first = 0
+            if version == 3:
+                where |= {name: episodes[e][f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
+                first, last = (episodes[e][f"videos/{key}/{end}_timestamp"] * FPS for end in ("from", "to"))
+                assert last - first == pytest.approx(n)
+            frames = video(root / info["video_path"].format(**where))[round(first) :]
+            for i in range(n):
+                assert np.array_equal(frames[i], known.picture(camera, e, i)), (key, e, i)
+
+
+def test_statistics_are_those_of_the_known_numbers(robot: tuple[int, Path]) -> None:
+    version, root = robot
+    sets = [(read_json(root, "meta", "stats.json"), known.rows())]
+    if version == 2:
+        lines = read_lines(root / "meta" / "episodes_stats.jsonl")
+        sets += [(line["stats"], [row for row in known.rows() if row[0] == line["episode_index"]]) for line in lines]
+        assert len(sets) == 3
+    for stats, rows in sets:
+        columns = {
+            "action": [known.action(e, i) for e, i in rows],
+            "observation.state": [known.joints(e, i) for e, i in rows],
+            "timestamp": [[np.float32(i / FPS)] for _, i in rows],
+            "task_index": [[known.task(e, i)] for e, i in rows],
+        }
+        for camera, name in enumerate(CAMERAS):
+            columns[f"observation.{name}.intrinsics"] = [known.intrinsics(camera, e, i).ravel() for e, i in rows]
+            columns[f"observation.{name}.T_world_from_cam"] = [known.pose(camera, e, i).ravel() for e, i in rows]
+        for name, values in columns.items():
+            entry, x = stats[name], np.asarray(values, np.float64)
+            want = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0), "count": [len(rows)]}
+            for kind, value in want.items():
+                same(entry[kind], value, 1e-6)
+        for camera, key in enumerate(KEYS):
+            picture = np.stack([known.picture(camera, e, i) for e, i in rows]).reshape(-1, 3) / 255
+            z = np.stack([stored_depth(camera, e, i) for e, i in rows])
+            z = z[z > 0]
+            for kind, of in (("mean", np.mean), ("std", np.std)):
+                same(np.ravel(stats[key][kind]), of(picture, 0), 1e-9)
+                same(np.ravel(stats[f"{key}_depth_enriched"][kind])[0], of(z), 1e-6)
+            for kind, q in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+                assert np.ravel(stats[f"{key}_depth_enriched"][kind])[0] == pytest.approx(np.quantile(z, q), rel=0.025)
+
+
+# ---------------------------------------------------------------------------------------------- enrich, other sources
+
+
+def write_simulator(file: Path) -> None:
+    """Both episodes of both cameras in one file of ManiSkill."""
+    h5py = pytest.importorskip("h5py")
+    other = file.with_name("other.h5")
+    for camera, part in enumerate((file, other)):
+        frames = known.episodes(camera, lens=False)
+        write_simulator_hdf5(part, frames, "maniskill3", camera=CAMERAS[camera])
+    with h5py.File(file, "a") as first, h5py.File(other) as second:
+        for e in range(len(LENGTHS)):
+            for group in ("sensor_data", "sensor_param"):
+                place = f"traj_{e}/obs/{group}"
+                second.copy(f"{place}/{CAMERAS[1]}", first[place])
+    other.unlink()
+
+
+def test_several_recordings_of_several_cameras_are_episodes_of_one_set(tmp_path: Path) -> None:
+    write_simulator(tmp_path / "demo.h5")
+    out = enrich(tmp_path / "demo.h5", tmp_path / "set", f"fps={FPS}", "task=look")
+    rows = read_rows(out)
+    assert len(rows) == sum(LENGTHS)
+    for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
+        assert (row["index"], row["episode_index"], row["frame_index"], row["task_index"]) == (index, e, i, 0)
+        assert row["timestamp"] == np.float32(i / FPS) and row["observation.frame_number"] == i
+        for camera, key in enumerate(KEYS):
+            assert np.array_equal(pixels(row[key]["bytes"]), known.picture(camera, e, i))
+            check_maps(row, camera, e, i, f"{key}_depth")
+    assert parquet.read_table(out / "meta" / "tasks.parquet").to_pylist() == [{"task_index": 0, "task": "look"}]
+
+
+def test_steps_of_rlds_keep_every_number(tmp_path: Path) -> None:
+    source = tmp_path / "1.0.0"
+    writers.write_rlds(source, known.episodes(1, lens=False))
+    out = enrich(source, tmp_path / "set", "data=rlds", f"fps={FPS}")
+    rows, key = read_rows(out), "observation.images.image_0"
+    assert len(rows) == sum(LENGTHS)
+    for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
+        assert (row["index"], row["episode_index"], row["frame_index"]) == (index, e, i)
+        assert row["timestamp"] == np.float32(i / FPS) and row["is_last"] == (i == LENGTHS[e] - 1)
+        same(row["action"], 1000 * e + 7 * i + np.arange(7))
+        assert np.array_equal(pixels(row[key]["bytes"]), known.picture(1, e, i))
+        same(np.reshape(row["observation.image_0_T_world_from_cam"], (4, 4)), known.pose(1, e, i), 1e-6)
+        same(np.reshape(row["observation.image_0_intrinsics"], (3, 3)), known.intrinsics(1, e, i))
+        check_maps(row, 1, e, i, f"{key}_depth")
+
+
+def test_nerfstudio_folders_are_of_their_own_camera_and_episode(tmp_path: Path) -> None:
+    known.write_robot(tmp_path / "source")
+    out = enrich(tmp_path / "source", tmp_path / "out", "format=nerfstudio")
+    folders = {(c, e): folder for folder in out.rglob("transforms.json") for c, e in [whose(folder.parent)]}
+    assert folders.keys() == {(c, e) for c in range(2) for e in range(2)}
+    for (camera, e), file in folders.items():
+        content = read_json(file)
+        assert content["camera_model"] == "OPENCV" and content["depth_unit_scale_factor"] == 1e-3
+        assert len(content["frames"]) == LENGTHS[e]
+        for i, shot in enumerate(content["frames"]):
+            K, z, sigma = (of(camera, e, i) for of in (known.intrinsics, stored_depth, stored_sigma))
+            size = [shot[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
+            same(size, [HW[1], HW[0], K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5])
+            same([shot.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")], LENS if camera else np.zeros(5), 1e-7)
+            same(shot["transform_matrix"], known.pose(camera, e, i) @ np.diag([1, -1, -1, 1]), 1e-7)
+            assert shot["timestamp"] == pytest.approx(i / FPS, abs=1e-6)
+            steps = pixels(file.parent / shot["depth_file_path"])
+            same(steps, np.rint(z / 1e-3))
+            relative = np.divide(sigma, z, where=z > 0, out=np.zeros_like(z))
+            same(pixels(file.parent / shot["confidence_file_path"]), np.where(z > 0, 25.5 / (0.1 + relative), 0), 0.6)
+            same(pixels(file.parent / shot["dhtorch_source_file_path"]), z > 0)
+            assert np.array_equal(pixels(file.parent / shot["file_path"]), known.picture(camera, e, i))
+        check_points(file.parent / content["ply_file_path"], camera, e)
+
+
+def whose(folder: Path) -> tuple[int, int]:
+    """Camera and episode of a folder by its name."""
+    return CAMERAS.index(folder.name), int(folder.parent.name.removeprefix("episode_"))
+
+
+def project(xyz: Array, camera: int, e: int, i: int) -> tuple[Array, Array]:
+    """Points of the world (P, 3) -> pixels (P, 2) by OpenCV's formulas, and depth (P,)."""
+    T = np.linalg.inv(known.pose(camera, e, i))
+    x, y, z = T[:3, :3] @ xyz.T + T[:3, 3:]
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = LENS if camera else (0.0,) * 5
+    r = x * x + y * y
+    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)
+    v = y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y
+    K = known.intrinsics(camera, e, i)
+    return np.stack((K[0, 0] * u + K[0, 2], K[1, 1] * v + K[1, 2]), 1), z
+
+
+def check_points(file: Path, camera: int, e: int) -> None:
+    """Every return of every frame is a point, in the colour of its pixel."""
+    points = read_ply(file)
+    xyz, rgb = (np.stack([points[name] for name in part], 1) for part in (("x", "y", "z"), ("red", "green", "blue")))
+    counts = [int((known.depth(camera, e, i) > 0).sum()) for i in range(LENGTHS[e])]
+    assert len(points) == sum(counts)
+    ends = np.cumsum([0, *counts])
+    for i, (start, end) in enumerate(itertools.pairwise(ends)):
+        v, u = np.nonzero(known.depth(camera, e, i))
+        at, z = project(xyz[start:end].astype(np.float64), camera, e, i)
+        same(at, np.stack((u, v), 1), 2e-3)
+        same(z, stored_depth(camera, e, i)[v, u], 1e-5)
+        assert np.array_equal(rgb[start:end], known.picture(camera, e, i)[v, u])
+
+
+# ------------------------------------------------------------------------------------------------------ complete
+
+
+@pytest.fixture(scope="module")
+def completed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four frames of the second camera in its second episode, completed, with their points; its files are counted from 1."""
+    root = tmp_path_factory.mktemp("completed")
+    writers.write_nerfstudio(root / "source", known.episodes(1)[1][:4])
+    words = [*FEW, "planes=8", "refinements=1", "steps=[30]", "figures=false", "points=all", "arrays=true"]
+    assert main(["complete", str(root / "source"), f"out={root / 'out'}", *words, "format=frames"]) == 0
+    return root / "out"
+
+
+def test_complete_writes_the_numbers_of_every_frame(completed: Path) -> None:
+    about, poses = read_json(completed, "meta.json"), np.loadtxt(completed / "poses.txt").reshape(-1, 4, 4)
+    assert about["depth_scale"] == 1000 and about["invalid"] == [0] and len(about["K_frames"]) == len(poses) == 4
+    same(about["dist"], LENS, 1e-7)
+    same(np.loadtxt(completed / "K.txt"), known.intrinsics(1, 1, 0))
+    same(about["K"], known.intrinsics(1, 1, 0))
+    for i in range(4):
+        K, T, z, time = (of(1, 1, i) for of in (known.intrinsics, known.pose, known.depth, known.time))
+        same(about["K_frames"][i], [K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        assert about["times"][i] == pytest.approx(time, abs=1e-6)
+        same(poses[i], T, 1e-7)
+        row = read_json(completed, "meta", f"{i + 1:06d}.json")
+        same(row["K"], K)
+        same(row["T_world_from_cam"], T, 1e-7)
+        same(row["distortion"], LENS, 1e-7)
+        assert row["frame"] == i + 1 and row["time"] == pytest.approx(time, abs=1e-6) and row["hw"] == list(HW)
+        assert (row["unit_m"], row["sigma_unit_m"]) == (1e-3, 2e-4) and i + 1 not in row["views"]
+        depth, sigma, source, image = (
+            pixels(completed / kind / f"{i + 1:06d}.png") for kind in ("depth", "sigma", "source", "images")
+        )
+        same(depth, np.rint(1e3 * z.astype(np.float64)))
+        same(sigma, np.rint(SIGMA_REL * z.astype(np.float64) / 2e-4), 1)  # on the edge of two steps
+        same(source, z > 0)
+        assert np.array_equal(image, known.picture(1, 1, i))
+        assert row["pixels"] == {"none": int((z == 0).sum()), "sensor": int((z > 0).sum()), "swept": 0}
+        arrays = np.load(completed / "arrays" / f"{i + 1:06d}.npz")
+        same(np.nan_to_num(arrays["depth"]), z)
+        same(np.nan_to_num(arrays["sigma"]), SIGMA_REL * z, 1e-7)
+        same(arrays["source"], z > 0)
+
+
+def test_points_and_mesh_of_complete_are_those_of_their_frame(completed: Path) -> None:
+    for i in range(4):
+        z = np.rint(1e3 * known.depth(1, 1, i).astype(np.float64)) / 1e3
+        v, u = np.nonzero(z)
+        points = read_ply(completed / "points" / f"{i + 1:06d}.ply")
+        xyz = np.stack([points[a] for a in "xyz"], 1).astype(np.float64)
+        T = known.pose(1, 1, i)
+        at, depth = project(xyz @ T[:3, :3].T + T[:3, 3], 1, 1, i)
+        same(at, np.stack((u, v), 1), 2e-3)
+        same(depth, z[v, u], 1e-5)
+        rgb = np.stack([points[name] for name in ("red", "green", "blue")], 1)
+        assert np.array_equal(rgb, known.picture(1, 1, i)[v, u])
+        same(points["sigma"], SIGMA_REL * z[v, u], 1.01e-4)  # half a step of the file
+        same(points["source"], np.ones(len(points)))
+        (node,), arrays = read_glb(completed / "points" / f"{i + 1:06d}.glb")
+        assert node["rotation"] == [1, 0, 0, 0], "y up"
+        (mesh,) = arrays
+        corners = mesh["POSITION"][mesh["indices"].reshape(-1, 3)]
+        assert len(corners) > 5000 and {*map(tuple, mesh["POSITION"].tolist())} <= {*map(tuple, xyz.tolist())}
+        same(mesh["COLOR_0"], linear(rgb), 1e-6)
+        # neighbouring pixels of one slanted wall: no triangle is longer than two pixels
+        assert np.ptp(corners, axis=1).max() < 2.5 * z.max() / known.intrinsics(1, 1, i)[0, 0]
+
+
+# ------------------------------------------------------------------------------------------------------- extract
+
+
+def test_rows_of_extract_are_those_of_their_frames(tmp_path: Path) -> None:
+    known.write_robot(tmp_path / "source")
+    words = ["data=lerobot", f"data.root={tmp_path / 'source'}", f"data.camera={KEYS[1]}", "extract.shard_rows=7"]
+    assert main(["extract", *words, "extract.gap=1", *FEW, f"out={tmp_path / 'out'}"]) == 0
+    rows = [r for f in sorted((tmp_path / "out").glob("*.parquet")) for r in parquet.read_table(f).to_pylist()]
+    assert len(rows) == sum(LENGTHS)
+    for row, (e, i) in zip(rows, known.rows(), strict=True):
+        assert (row["episode_index"], row["frame_index"]) == (e, i) and row["timestamp"] == np.float32(i / FPS)
+        assert row["recording"].endswith(f"episode_{e:06d}/{CAMERAS[1]}")
+        uv = np.asarray(row["uv"])
+        u, v = np.floor(uv + 0.5).astype(int).T  # of the nearest pixel
+        z, is_sensor = known.depth(1, e, i)[v, u], np.asarray(row["source"]) == Source.SENSOR
+        assert np.array_equal(is_sensor, z > 0) and len(u) == 64
+        valid, hole = np.asarray(row["valid"]), np.asarray(row["hole"])
+        assert np.array_equal(valid, np.asarray(row["source"]) != Source.NONE)
+        assert np.array_equal(hole == Hole.NONE, is_sensor)
+        same(np.asarray(row["depth"])[is_sensor], z[is_sensor])
+        same(np.asarray(row["sigma"])[is_sensor], SIGMA_REL * z[is_sensor], 1e-7)
+        xyz, T = np.asarray(row["xyz"]), known.pose(1, e, i)
+        assert not xyz[~valid].any() and not np.asarray(row["depth"])[~valid].any()
+        at, depth = project(xyz[valid] @ T[:3, :3].T + T[:3, 3], 1, e, i)
+        same(at, uv[valid], 5e-3)
+        same(depth, np.asarray(row["depth"])[valid], 1e-5)
+        check_tokens(row, *uv.T, valid)
+        if not row["pose_ok"]:
+            same(row["T_1_from_0"], np.zeros((4, 4)))
+            same(row["pose_cov"], np.zeros((6, 6)))
+        if i == 0:
+            assert not row["pose_ok"] and (np.asarray(row["gate"]) == Gate.NO_TRACK).all()
+
+
+def check_tokens(row: dict[str, Any], u: Array, v: Array, valid: Array) -> None:
+    """Tokens of the 16 x 16 patches of a picture that is stretched to 224 x 224."""
+    patch = ((v + 0.5) * 224 / HW[0] // 14 * 16 + (u + 0.5) * 224 / HW[1] // 14).astype(int)
+    tokens, depth, sigma = (np.asarray(row[name]) for name in ("tokens", "depth", "sigma"))
+    hole = np.asarray(row["hole"])
+    for k, token in enumerate(tokens):
+        inside = patch == k
+        there = inside & valid
+        assert row["tokens_valid"][k] == there.any()
+        want = np.zeros(3 + tokens.shape[1] - 3)
+        if there.any():
+            inverse, noise = 1 / depth[there], sigma[there] / depth[there] ** 2
+            want[:2] = inverse.mean(), np.sqrt((noise**2).mean() + inverse.var())
+        if inside.any():
+            want[2] = valid[inside].mean()
+            want[3:] = np.bincount(hole[inside], minlength=len(want) - 3) / inside.sum()
+        same(token, want, 1e-5)
+
+
+# --------------------------------------------------------------------------------------------------------- writers
+
+
+def read_ply(file: Path) -> Array:
+    """Vertices of a binary PLY file, by its header."""
+    head, _, body = file.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in head.decode().splitlines()]
+    assert lines[1][1] == "binary_little_endian"
+    n = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
+    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+    columns = [(line[2], kinds[line[1]]) for line in lines if line[0] == "property" and line[1] != "list"]
+    return np.frombuffer(body, columns, n)
+
+
+def read_glb(file: Path) -> tuple[list[Any], list[dict[str, Array]]]:
+    """Nodes, and the arrays of every mesh by attribute."""
+    data = file.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+
+    def array(k: int) -> Array:
+        accessor = document["accessors"][k]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
+        dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        values = np.frombuffer(body, dtype, accessor["count"] * width, view["byteOffset"])
+        return values.reshape(-1, width) if width > 1 else values
+
+    meshes = []
+    for mesh in document["meshes"]:
+        (primitive,) = mesh["primitives"]
+        arrays = {name: array(k) for name, k in primitive["attributes"].items()}
+        meshes.append(arrays | ({"indices": array(primitive["indices"])} if "indices" in primitive else {}))
+    return document["nodes"], meshes
+
+
+def linear(rgb: Array) -> Array:
+    """sRGB of 8 bits -> linear."""
+    x = rgb / 255
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def drawn(n: int, seed: int = 0) -> dict[str, Array]:
+    """Points with distinct numbers, one of them without a place."""
+    draw = np.random.default_rng(seed)
+    xyz = draw.uniform(-2, 2, (n, 3)) + np.array([0, 0, 4])
+    xyz[1, 2] = np.nan
+    numbers = {"sigma": draw.uniform(0.01, 0.1, n), "score": draw.random(n)}
+    codes = {"source": draw.integers(0, 6, n), "hole": draw.integers(0, 5, n)}
+    return {"xyz": xyz, "rgb": draw.integers(0, 256, (n, 3)).astype(np.uint8), **numbers, **codes}
+
+
+def test_ply_and_glb_hold_every_column(tmp_path: Path) -> None:
+    points = drawn(9)
+    kept = np.isfinite(points["xyz"]).all(1)
+    normal = np.roll(np.nan_to_num(points["xyz"]), 1, 1)
+    face = np.array([[0, 2, 3], [1, 4, 5], [8, 6, 7]])  # of which one has a corner that is left out
+    values = {name: points[name] for name in ("sigma", "score", "source", "hole")}
+    n = write_ply(tmp_path / "a.ply", points["xyz"], points["rgb"], normal=normal, face=face, **values)
+    vertex = read_ply(tmp_path / "a.ply")
+    want = {**dict(zip("xyz", points["xyz"].T, strict=True)), **dict(zip(("nx", "ny", "nz"), normal.T, strict=True))}
+    want |= dict(zip(("red", "green", "blue"), points["rgb"].T, strict=True))
+    want |= {"sigma": points["sigma"], "score": points["score"], "quality": points["sigma"]}
+    want |= {"source": points["source"], "class": points["hole"]}
+    assert n == len(vertex) == 8 and {*vertex.dtype.names} == {*want}
+    for name, column in want.items():
+        same(vertex[name], column[kept], 1e-6)
+    tail = (tmp_path / "a.ply").read_bytes()[-26:]
+    assert [struct.unpack_from("<Biii", tail, 13 * k) for k in range(2)] == [(3, 0, 1, 2), (3, 7, 5, 6)]
+
+    shapes = [
+        Shape("left", points["xyz"], points["rgb"], normal, face, {"sigma": points["sigma"]}),
+        Shape("right", points["xyz"] + 10, points["rgb"][::-1].copy()),
+    ]
+    write_glb(tmp_path / "a.glb", shapes, up=(0.0, 1.0, 0.0))
+    nodes, meshes = read_glb(tmp_path / "a.glb")
+    assert [node["name"] for node in nodes] == ["left", "right"] and all(node["rotation"][3] == 1 for node in nodes)
+    for mesh, shift, rgb in zip(meshes, (0, 10), (points["rgb"], points["rgb"][::-1]), strict=True):
+        same(mesh["POSITION"], points["xyz"][kept] + shift, 1e-5)
+        same(mesh["COLOR_0"], linear(rgb[kept]), 1e-6)
+    same(meshes[0]["NORMAL"], (normal / np.linalg.norm(normal, axis=1, keepdims=True))[kept], 1e-6)
+    same(meshes[0]["_SIGMA"], points["sigma"][kept], 1e-7)
+    assert meshes[0]["indices"].tolist() == [0, 1, 2, 7, 5, 6] and "indices" not in meshes[1]
+
+
+def rotation(quaternion: Sequence[float]) -> Array:
+    """w, x, y, z -> (3, 3)."""
+    w, *v = quaternion
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + 2 * w * K + 2 * K @ K
+
+
+def lines_of(file: Path) -> list[str]:
+    return [line for line in file.read_text().split("\n")[:-1] if not line.startswith("#")]
+
+
+def test_a_colmap_model_holds_every_number(tmp_path: Path) -> None:
+    """Both cameras in two frames; points are seen by some of them, and tracks lead back to their observations."""
+    where = [(camera, 1, i) for camera in (0, 1) for i in (2, 5)]
+    frames = [known.frame(*each) for each in where]
+    shots = [
+        ColmapImage(f"{k}.png", frame.camera, HW, frame.T_world_from_cam, known.time(*at))
+        for k, (frame, at) in enumerate(zip(frames, where, strict=True))
+    ]
+    points, draw = drawn(20), np.random.default_rng(1)
+    seen = draw.permuted(np.tile(np.arange(4), (20, 1)), axis=1)
+    seen[draw.random((20, 4)) < 0.4] = -1
+    uv, error = draw.uniform(0, 40, (20, 4, 2)), draw.random(20)
+    uv[3, 2] = np.nan
+    write_colmap(tmp_path, shots, points["xyz"], rgb=points["rgb"], error=error, seen_by=seen, uv=torch.from_numpy(uv))
+
+    cameras = {int(w[0]): w[1:] for w in map(str.split, lines_of(tmp_path / "cameras.txt"))}
+    images = lines_of(tmp_path / "images.txt")
+    observed: dict[int, list[list[float]]] = {}
+    assert len(images) == 8 and len(cameras) == 4
+    times = dict(map(str.split, lines_of(tmp_path / "times.txt")))
+    for k, at in enumerate(where):
+        words = images[2 * k].split()
+        assert int(words[0]) == k + 1 and words[9] == f"{k}.png" and float(times[words[0]]) == known.time(*at)
+        T = np.linalg.inv(known.pose(*at))
+        same(rotation([float(x) for x in words[1:5]]), T[:3, :3], 1e-8)
+        same([float(x) for x in words[5:8]], T[:3, 3], 1e-8)
+        model, *numbers = cameras[int(words[8])]
+        K = known.intrinsics(*at)
+        lens = (*LENS, 0, 0, 0) if at[0] else ()
+        assert model == ("FULL_OPENCV" if at[0] else "PINHOLE")
+        same([float(x) for x in numbers], [HW[1], HW[0], *K[[0, 1], [0, 1]], *(K[:2, 2] + 0.5), *lens], 1e-7)
+        values = [float(x) for x in images[2 * k + 1].split()]
+        observed[k + 1] = np.reshape(values, (-1, 3)).tolist()
+    rows = [line.split() for line in lines_of(tmp_path / "points3D.txt")]
+    kept = np.flatnonzero(np.isfinite(points["xyz"]).all(1))
+    assert [int(row[0]) for row in rows] == list(range(1, len(kept) + 1))
+    for row, p in zip(rows, kept, strict=True):
+        same([float(x) for x in row[1:4]], points["xyz"][p], 1e-8)
+        assert [int(x) for x in row[4:7]] == points["rgb"][p].tolist() and float(row[7]) == pytest.approx(error[p])
+        track = np.reshape([int(x) for x in row[8:]], (-1, 2)).tolist()
+        want = [(shot, uv[p, k]) for k, shot in enumerate(seen[p]) if shot >= 0 and np.isfinite(uv[p, k]).all()]
+        assert [image for image, _ in track] == [shot + 1 for shot, _ in want]
+        for (image, place), (_, pixel) in zip(track, want, strict=True):
+            same(observed[image][place], [*(pixel + 0.5), int(row[0])], 1e-7)
+    assert sum(map(len, observed.values())) == sum(len(row[8:]) // 2 for row in rows) > 20
+
+
+def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) -> None:
+    draw, n = np.random.default_rng(2), 12
+    columns: dict[str, Array] = {name: draw.random(n, np.float32) for name in ("depth", "sigma", "parallax_deg")}
+    columns |= {name: draw.random(n, np.float32) for name in ("residual_px", "error", "score")}
+    columns |= {"uv_0": draw.uniform(0, 40, (n, 2)), "uv_1": draw.uniform(-9, 40, (n, 2))}
+    columns |= {"xyz": draw.random((n, 3), np.float32), "rgb": draw.integers(0, 256, (n, 3)).astype(np.uint8)}
+    codes = ("tracked", "source", "gate", "hole", "candidate", "cause")
+    columns |= {name: draw.integers(0, 2, n).astype(np.uint8) for name in codes}
+    clouds = [PointCloud(draw.random((n, 3), np.float32), draw.integers(0, 256, (n, 3)).astype(np.uint8)) for _ in "ab"]
+    swept = SweptPointCloud(
+        clouds[0].xyz + 5, clouds[1].rgb, columns["sigma"] + 1, columns["score"], 2.0, columns["cause"]
+    )
+    shot = PairExhibit(
+        "a pair",
+        columns,
+        known.pose(0, 0, 1),
+        known.pose(1, 1, 3),
+        0,
+        1,
+        clouds[0],
+        clouds[1],
+        swept,
+        None,
+        {"n": "12"},
+    )
+    views = [
+        ExhibitView(10 + c, known.time(c, c, 3), bytes([c, 7]), HW, (480 + c, 640), (60.0 + c, 61.0), (31.5, 23.5 + c))
+        for c in range(2)
+    ]
+    path = np.stack([known.pose(0, 0, i)[:3, 3] for i in range(5)])
+    file = html.write_viewer_page(tmp_path / "a.html", Exhibit("known", [shot], views, path, {"k": "v"}))
+    data = json.loads(file.read_text().partition('type="application/json" id="data">')[2].partition("</script>")[0])
+    for k, (view, sent) in enumerate(zip(views, data["views"], strict=True)):
+        assert (sent["number"], sent["time"]) == (10 + k, view.time)
+        assert (sent["hw"], sent["f"], sent["c"]) == (list(view.hw), list(view.f), list(view.c))
+        assert base64.b64decode(sent["jpeg"]) == view.jpeg
+    (sent,) = data["shots"]
+    assert (sent["label"], sent["view_0"], sent["view_1"]) == ("a pair", 0, 1)
+    same(np.reshape(sent["T_world_from_0"], (3, 4)), known.pose(0, 0, 1)[:3])
+    same(np.reshape(sent["T_world_from_1"], (3, 4)), known.pose(1, 1, 3)[:3])
+    same(unpack(data["path"]), path.ravel(), 1e-7)
+    for name, values in columns.items():
+        packed = unpack(sent["samples"][name])
+        if name in ("uv_0", "uv_1"):
+            same(packed / data["per_pixel"] - data["margin_px"], values.ravel(), 0.5 / data["per_pixel"] + 1e-6)
+        else:
+            same(packed / 65535 if name == "score" else packed, values.ravel(), 1e-5 if name == "score" else 0)
+    for name, cloud in (("seen", clouds[0]), ("held_out", clouds[1]), ("swept", swept)):
+        same(unpack(sent[name]["xyz"]).reshape(-1, 3) * sent[name]["step"] + sent[name]["low"], cloud.xyz, 1e-5)
+        same(unpack(sent[name]["rgb"]), cloud.rgb.ravel())
+    same(unpack(sent["swept"]["sigma"]), swept.sigma)
+    same(unpack(sent["swept"]["score"]) / 65535, swept.score, 1e-5)
+    same(unpack(sent["swept"]["cause"]), columns["cause"])
+    assert sent["swept"]["step_px"] == 2.0
+
+
+def unpack(packed: dict[str, str]) -> Array:
+    return np.frombuffer(base64.b64decode(packed["base64"]), f"<{packed['type']}").astype(np.float64)
