@@ -2,10 +2,13 @@
 
     python benchmarks/kills.py --times 50 --json benchmarks/results/kills.json
 
-Every fault hits ``dhtorch extract`` and ``dhtorch enrich`` on a small set, with two workers, at a moment drawn from the
-seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody
-disturbed: ``lost``, ``doubled`` and ``changed`` files, and hidden files and processes ``left`` behind, each of which
-must be 0. Commands are forked off a process that has imported what they need, so that faults hit work, not imports.
+Every fault hits ``dhtorch extract``, ``enrich`` (two workers each) and ``complete`` on a small set, at a moment drawn
+from the seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody
+disturbed: ``lost``, ``doubled`` and ``changed`` files, and unfinished files and processes ``left`` behind. Of two that
+race, each must be right or refused in one line, else it is ``unclear``; the files of one that succeeded are compared
+before the further run, too. Last, files of others are put beside the outputs and the command is run once more:
+``deleted`` counts those that are gone or changed. Each of these must be 0. Commands are forked off a process that has
+imported what they need, so that faults hit work, not imports.
 """
 
 from __future__ import annotations
@@ -27,20 +30,25 @@ from pathlib import Path
 from typing import cast
 
 from dhtorch import extract  # noqa: F401 (imported once, before commands are forked)
-from dhtorch.cli import enrich, run  # noqa: F401
-from dhtorch.runtime import (
-    results as result_files,
-)
-from dhtorch.runtime import (
-    storage,
-)
+from dhtorch.cli import complete, enrich, run  # noqa: F401
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER, is_private
 
-ROOM = ("data=synthetic", "data.n_frames=6", "data.hw=[96,128]", "data.depth_hw=[48,64]", "method.n=64", "workers=2")
+ROOM = (
+    "data=synthetic",
+    "data.n_frames=6",
+    "data.hw=[48,64]",
+    "data.depth_hw=[24,32]",
+    "data.supersample=1",
+    "method.n=64",
+)
 COMMANDS = {
-    "extract": (*ROOM, "extract.gap=1", "extract.shard_rows=1", "extract.columns=[depth]"),
-    "enrich": (*ROOM, "shard_rows=1", "report=false"),
+    "extract": (*ROOM, "workers=2", "extract.gap=1", "extract.shard_rows=1", "extract.columns=[depth]"),
+    "enrich": (*ROOM, "workers=2", "shard_rows=1", "report=false", "dense={planes: 8}"),
+    "complete": (*ROOM, "planes=8", "refinements=1", "steps=[1]", "figures=false"),
 }
-LOSSES = "lost", "doubled", "changed", "left"
+LOSSES = "lost", "doubled", "changed", "left", "unclear", "deleted"
 FORK = get_context("fork")
 PATIENCE_S = 5  # after which a process that lives on is left behind
 
@@ -59,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for command in COMMANDS:
             rows += suffered(command, Path(place) / command, options)
     bad = sum(int(row[loss]) for row in rows for loss in LOSSES)
-    print(f"{bad} lost, doubled, changed or left")
+    print(f"{bad} lost, doubled, changed, left, unclear or deleted")
     if options.json:
         storage.write_json(options.json, rows)
     return int(bad > 0)
@@ -81,9 +89,14 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
             processes = fault(command, folder, draw.uniform(0.0, 1.0) * took)
             counts["left"] += ended(*processes)
             counts["hit"] += any(p.exitcode for p in processes)
+            if name == "race":
+                counts["unclear"] += sum(not _is_clear(folder, process) for process in processes)
+                if not all(process.exitcode for process in processes):
+                    counts.update(difference(want, contents(folder)))
             start(command, folder).join()
             counts.update(difference(want, contents(folder)))
-            counts["left"] += sum(file.name.startswith(".") for file in folder.rglob("*"))
+            counts["left"] += len(unfinished(folder))
+            counts["deleted"] += deleted(command, folder)
             shutil.rmtree(folder)
         if _checkout() != source:
             raise SystemExit("the checkout changed meanwhile: run it where nobody works")
@@ -109,8 +122,9 @@ def start(command: str, folder: Path, limit: int | None = None) -> ForkProcess:
 def _run(command: str, folder: Path, limit: int | None) -> None:
     os.setsid()
     nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nowhere, stream)
+    messages = os.open(_messages(folder, os.getpid()), os.O_WRONLY | os.O_CREAT, 0o644)
+    for stream, file in enumerate((nowhere, nowhere, messages)):
+        os.dup2(file, stream)
     if limit is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     raise SystemExit(run.main([command, *COMMANDS[command], f"out={folder}"]))
@@ -170,9 +184,38 @@ FAULTS: dict[str, Callable[[str, Path, float], list[ForkProcess]]] = {
 }
 
 
-def contents(folder: Path) -> dict[str, str]:
-    """Name → digest of the files."""
+def _messages(folder: Path, process: int) -> Path:
+    """File of what a process prints to stderr."""
+    return folder.with_name(f"{folder.name}.{process}.txt")
+
+
+def _is_clear(folder: Path, process: ForkProcess) -> bool:
+    """Whether a process succeeded, or was refused in one line because another one writes there."""
+    lines = _messages(folder, cast("int", process.pid)).read_text(encoding="utf-8").splitlines()
+    refusal = "found another dhtorch process"
+    return not process.exitcode or (process.exitcode == run.EXIT_FAILED and len(lines) == 1 and refusal in lines[0])
+
+
+def unfinished(folder: Path) -> list[Path]:
+    """Hidden files, and files of the private folder beside the manifest."""
     files = [file for file in folder.rglob("*") if file.is_file()]
+    manifest = folder / PRIVATE_FOLDER / "manifest"
+    return [f for f in files if f != manifest and (f.name.startswith(".") or is_private(f.relative_to(folder)))]
+
+
+def deleted(command: str, folder: Path) -> int:
+    """How many files of others a further run removes or changes; they are put beside all outputs."""
+    folders = [place for place in (folder, *folder.rglob("*")) if place.is_dir() and place.name != PRIVATE_FOLDER]
+    others = [place / name for place in folders for name in ("mine.png", ".mine.tmp", "mine.parquet")]
+    for file in others:
+        file.write_bytes(b"mine")
+    start(command, folder).join()
+    return sum(not file.is_file() or file.read_bytes() != b"mine" for file in others)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Name → digest of the files, dhtorch's records excluded."""
+    files = [file for file in folder.rglob("*") if file.is_file() and not is_private(file.relative_to(folder))]
     return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
