@@ -21,6 +21,11 @@ SOURCE_FIELDS = "image", "camera"
 #: exceed it. Source: derived, twice the range.
 MAX_IMAGE_VALUE = 2.0
 
+#: What messages expect of depth, and of an image's dtype and values, here and in transforms.
+EXPECTED_METRES = "expected floating point, m"
+EXPECTED_IMAGE = "expected uint8, or floating point in [0, 1]"
+EXPECTED_RANGE = "expected [0, 1] (of [0, 255]: image / 255)"
+
 #: Every so many pixels of a row and a column are compared with it, so that a check costs nothing beside a stage.
 #: Source: derived, 1 of 64 pixels.
 _CHECK_STRIDE = 8
@@ -66,7 +71,7 @@ def _check_frame(name: str, frame: Frame, fields: tuple[str, ...], device: torch
     _check_image(f"method: {name}.image", frame.image)
     if "depth" in fields and not frame.depth.is_floating_point():
         raise ValueError(
-            f"method: {name}.depth is {_name(frame.depth)}, expected floating point, m (of mm: depth.float() / 1000)"
+            f"method: {name}.depth is {dtype_name(frame.depth)}, {EXPECTED_METRES} (of mm: depth.float() / 1000)"
         )
 
 
@@ -74,7 +79,7 @@ def _check_image(where: str, image: Tensor) -> None:
     """Raise ValueError for an image of another dtype, number of channels or range; the range only where it is read
     without waiting for a device."""
     if image.dtype != torch.uint8 and not image.is_floating_point():
-        raise ValueError(f"{where} is {_name(image)}, expected uint8, or floating point in [0, 1]")
+        raise ValueError(f"{where} is {dtype_name(image)}, {EXPECTED_IMAGE}")
     if image.ndim == 4 and image.shape[1] not in (1, 3):
         raise ValueError(
             f"{where} has shape {tuple(image.shape)}, expected (B C H W) with C 1 or 3 (RGBA: image[:, :3])"
@@ -82,10 +87,11 @@ def _check_image(where: str, image: Tensor) -> None:
     if image.is_floating_point() and not is_static(image):
         largest = float(image.detach()[..., ::_CHECK_STRIDE, ::_CHECK_STRIDE].amax())
         if largest > MAX_IMAGE_VALUE:
-            raise ValueError(f"{where} has values up to {largest:g}, expected [0, 1] (of [0, 255]: image / 255)")
+            raise ValueError(f"{where} has values up to {largest:g}, {EXPECTED_RANGE}")
 
 
-def _name(x: Tensor) -> str:
+def dtype_name(x: Tensor) -> str:
+    """Name of a tensor's dtype as numpy has it, such as ``uint16``."""
     return str(x.dtype).removeprefix("torch.")
 
 

@@ -286,7 +286,7 @@ def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor,
     where &= _in_block(both[:, 1:, 1:] & both[:, 1:, :-1] & both[:, :-1, 1:] & both[:, :-1, :-1])
     filled[b, y, x] = torch.where(fits, q, 1.0)
     square = sum((one.square() for one in distance), torch.zeros_like(q))
-    spread[b, y, x] = sigma + (square / n).sqrt()
+    spread[b, y, x] = (sigma + (square / n).sqrt()).to(spread)
     return where, filled, spread
 
 

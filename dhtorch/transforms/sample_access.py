@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import all_known, is_transformed
 from dhtorch.geometry.least_squares import has_graph
+from dhtorch.pipeline.inputs import EXPECTED_IMAGE, dtype_name
 from dhtorch.records import Camera
 
 if TYPE_CHECKING:
@@ -188,17 +189,19 @@ class SampleReader:
 
     def images(self, key: str, layout: str | None) -> Tensor:
         """Key of images -> (B, T, C, H, W), uint8 or floating."""
-        x = self.get(key)
+        x = self.get(key, signed=False)
         if x.ndim not in (4, 5):
             shape = tuple(x.shape[1:])
             raise SampleError(f"{key}: found shape {shape}, expected (C, H, W) or (H, W, C), or with T in front")
         if x.dtype != torch.uint8 and not x.is_floating_point():
-            raise SampleError(f"{key}: found {x.dtype}, expected uint8, or float in [0, 1]")
+            raise SampleError(f"{key}: found {dtype_name(x)}, {EXPECTED_IMAGE}")
         x = x if x.ndim == 5 else x[:, None]
         first, last = x.shape[2] in (1, 3), x.shape[4] in (1, 3)
         if layout is None and first == last:
             shape = tuple(x.shape[2:])
-            raise SampleError(f"{key}: found shape {shape}, expected one axis of 1 or 3 channels; or state layout")
+            raise SampleError(
+                f"{key}: found shape {shape}, expected one axis of 1 or 3 channels (RGBA: the first 3); or state layout"
+            )
         hwc = last if layout is None else layout == "hwc"
         if not (last if hwc else first):
             raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")

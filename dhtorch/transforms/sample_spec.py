@@ -23,6 +23,7 @@ from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry.checks import all_known, is_transformed
 from dhtorch.geometry.no_depth import clear_far_constant, clear_saturated
 from dhtorch.ops.dispatch import operator
+from dhtorch.pipeline.inputs import EXPECTED_METRES, EXPECTED_RANGE, dtype_name
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Frame, PosePrior
 from dhtorch.transforms import poses
@@ -197,7 +198,7 @@ class SampleSpec:
             SampleError: integers with the unit m.
         """
         if self.depth_unit == "m" and not maps[0].is_floating_point():
-            raise SampleError(f"{self.depth}: found whole numbers ({maps[0].dtype}), expected metres; is the unit mm?")
+            raise SampleError(f"{self.depth}: found {dtype_name(maps[0])}, {EXPECTED_METRES}; is the unit mm?")
         if any(x.dtype not in (torch.int16, torch.uint16) for x in maps):
             z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
         else:
@@ -466,7 +467,7 @@ def _unit_range_checks(image: Tensor, key: str) -> list[tuple[Tensor, Tensor, st
     """Images (B, C, H, W) -> checks that floats lie in [0, 1]."""
     if image.dtype == torch.uint8:
         return []
-    text = f"{key}: found the value {{:.4g}}, expected floats in [0, 1] (pixels before any normalisation)"
+    text = f"{key}: found the value {{:.4g}}, {EXPECTED_RANGE}, pixels before any normalisation"
     low, high = (f(image.detach(), (1, 2, 3)) for f in (torch.amin, torch.amax))  # no copy for any layout
     bad_low, bad_high = ~(low >= -1e-3), ~(high <= 1 + 1e-3)
     return [(bad_low | bad_high, torch.where(bad_high, high, low), text)]
