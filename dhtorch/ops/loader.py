@@ -30,6 +30,7 @@ import os
 import platform
 import stat
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -72,6 +73,10 @@ FLAGS = ("-O3", "-std=c++20", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "
 #: Vector level of x86-64 that torch reports (``torch.backends.cpu.get_cpu_capability``) → compiler's name of the level;
 #: SSE4.2 for the processors below AVX2.
 LEVELS = {"AVX512": "x86-64-v4", "AVX2": "x86-64-v3", "DEFAULT": "x86-64-v2"}
+
+#: Time in which a build replaces a library and its manifest, s. Source: derived, two renames take below 1 ms; longer
+#: where the machine is busy.
+_REPLACEMENT_S = 0.2
 
 _X86_64 = ("x86_64", "amd64")
 
@@ -156,6 +161,15 @@ def problem(path: Path) -> str | None:
     return None if checksum(path) == expected else f"{path} differs from its checksum"
 
 
+def _problem_after_replacement(path: Path) -> str | None:
+    """As :func:`problem`, asked again after a moment where a build may be replacing the file and its manifest."""
+    reason = problem(path)
+    if reason is None:
+        return None
+    time.sleep(_REPLACEMENT_S)
+    return problem(path)
+
+
 def _user(otherwise: int) -> int:
     """This process's user; ``otherwise`` on systems without user numbers."""
     return int(getattr(os, "getuid", lambda: otherwise)())
@@ -175,7 +189,7 @@ def load() -> None:
     for path in (INSTALLED / name, cache() / name):
         if not path.is_file():
             continue
-        reason = problem(path)
+        reason = _problem_after_replacement(path)
         if reason is None:
             try:
                 torch.ops.load_library(str(path.resolve()))
