@@ -85,6 +85,10 @@ class DatasetSource(Protocol):
         """Folder of the files that image cells name; None = cells hold images."""
 
     @property
+    def bounds(self) -> Path | None:
+        """Folder that links must not lead out of; None = links are followed, or no file is named by a cell."""
+
+    @property
     def stats(self) -> dict[str, Any]:
         """Statistics by feature, as in ``meta/stats.json``; empty if it has none."""
 

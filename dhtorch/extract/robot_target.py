@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import names
+from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
@@ -110,12 +111,12 @@ class LeRobotTarget:
         if not keys:
             return {}
         first = next(iter(origin.batches(0, [])))
-        return {
-            key: pixel_columns.read_pixel_feature(
-                key, self.source_features[key], first.column(key)[0].as_py(), origin.root
-            )
-            for key in keys
-        }
+        cells = {key: first.column(key)[0].as_py() for key in keys}
+        with doors.restrict_links(origin.bounds):
+            return {
+                key: pixel_columns.read_pixel_feature(key, self.source_features[key], cell, origin.root)
+                for key, cell in cells.items()
+            }
 
     def _keys(self, view: DatasetCamera) -> dict[str, str]:
         """Camera -> added columns: kind → column name."""
@@ -205,6 +206,7 @@ class LeRobotTarget:
         path = self.file(k)
         length, writer = 0, None
         with storage.write_atomically(path) as sink, ExitStack() as closing:
+            closing.enter_context(doors.restrict_links(None if self.origin is None else self.origin.bounds))
             policy = {key: closing.enter_context(self._open_policy_columns(k, key)) for key in self.views}
             for table in self._join_rows(k, start, parts, tallies, policy, tasks):
                 if writer is None:

@@ -45,6 +45,7 @@ class RldsSource:
     version = None
     tasks = None
     root = None
+    bounds = None
     robot = "unknown"
 
     @property

@@ -627,3 +627,29 @@ def test_metadata_of_other_types_are_no_folder_of_enrich(robot, tmp_path, capsys
     message = capsys.readouterr().err
     assert "dhtorch.json: found " in message and message.count("\n") == 1
     assert [*read_files(out)] == ["meta/dhtorch.json"], "nothing is written"
+
+
+@pytest.mark.parametrize("linked", [0, 1])
+def test_pictures_named_by_cells_are_not_read_through_links(robot, tmp_path, capsys, linked):
+    """A mask in files beside the tables, of which one is a link to a file outside."""
+    source, outside = tmp_path / "source", tmp_path / "secret.png"
+    shutil.copytree(robot, source)
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["features"]["mask"] = {"dtype": "image", "shape": [*HW, 1], "names": ["height", "width", "channel"]}
+    (source / "meta" / "info.json").write_text(json.dumps(info))
+    table = next((source / "data").rglob("*.parquet"))
+    content = parquet.read_table(table)
+    cells = [{"bytes": None, "path": f"masks/{i}.png"} for i in range(content.num_rows)]
+    parquet.write_table(content.append_column("mask", pyarrow.array(cells)), table)
+    (source / "masks").mkdir()
+    for i in range(content.num_rows):
+        Image.fromarray(np.full(HW, i, np.uint8)).save(source / "masks" / f"{i}.png")
+    asked = ["enrich", str(source), *ASKED, "data=lerobot", "data.episode=0", f"data.camera={FRONT}"]
+    assert main([*asked[:2], str(tmp_path / "sound"), *asked[2:]]) == 0
+    picture = source / "masks" / f"{linked}.png"
+    picture.rename(outside)
+    picture.symlink_to(outside)
+    capsys.readouterr()
+    assert main([*asked[:2], str(tmp_path / "set"), *asked[2:]]) == 2
+    message = capsys.readouterr().err
+    assert f"masks/{linked}.png: link: found one to outside the capture" in message and message.count("\n") == 1

@@ -94,6 +94,8 @@ def _views_of_arrays(
         conf = values["conf"].reshape(n, *maps.shape[1:3]) if "conf" in values else None
     except ValueError as error:
         raise FormatError(archive, "shapes", error, f"the same number of views in all arrays, here {n}") from None
+    if maps.ndim != 4 or maps.shape[-1] != trailing:
+        raise FormatError(archive, "depth or points", f"shape {maps.shape}", f"(views, height, width, {trailing})")
     if names is not None and len(names) != n:
         raise FormatError(archive, "names", f"{len(names)} names or pictures", f"one for each of {n} views")
     c2w = full if "c2w" in values else _invert(archive, full)
