@@ -2,7 +2,7 @@
 child under the law of docs/data.md: time, memory, writes, code.
 
     make fuzz                                            # some thousand seeded cases, within ten minutes
-    python benchmarks/fuzz.py --full --json benchmarks/results/fuzz.json   # 20,000 and more
+    python benchmarks/fuzz.py --full --json benchmarks/results/fuzz.json   # more than 20,000
     python benchmarks/fuzz.py --only lerobot_v2 --case 17                  # one case again
 
 Half of the cases are bytes damaged (``tests/support/byte_damage.py``), half are files taken apart and put together
@@ -33,7 +33,7 @@ from dhtorch.data.io.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 from dhtorch.runtime import storage  # noqa: E402
 
 SAMPLES = CAPTURES | OTHER_INPUTS
-SOME, MANY = 150, 1000  # cases of every format
+SOME, MANY = 150, 350  # cases of every format or other input
 SECONDS = 20  # of a processor
 #: Memory in bytes of an input that is no capture: its arrays may have any size that its files have.
 OTHER_BYTES = 2 << 30

@@ -155,9 +155,15 @@ USER_SETTINGS = {"method": "paper", "data": "synthetic"}
 
 
 @cache
+def _kept_folder(name: str) -> tempfile.TemporaryDirectory[str]:
+    """A folder that is removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix=f"dhtorch-{name}-")
+
+
+@cache
 def settings_folder() -> Path:
     """A copy of the settings with links to a user's files, which are set by :func:`read_settings`."""
-    folder = Path(tempfile.mkdtemp(prefix="dhtorch-settings-"))
+    folder = Path(_kept_folder("settings").name)
     shutil.copytree(ROOT / "conf", folder, dirs_exist_ok=True)
     return folder
 
@@ -193,7 +199,7 @@ def read_settings(path: Path) -> None:
 
 @cache
 def _enriched() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="dhtorch-enriched-"))
+    folder = Path(_kept_folder("enriched").name)
     (folder / "source").mkdir()
     write_lerobot_v3(folder / "source")
     asked = ["method=paper", "method.n=32", "method.hypotheses=5", "gap=1", "dense=false", "report=false", "--quiet"]
@@ -235,7 +241,7 @@ def read_enriched(path: Path) -> None:
 
 @cache
 def _extraction() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="dhtorch-extraction-"))
+    folder = Path(_kept_folder("extraction").name)
     (folder / "source").mkdir()
     write_tum(folder / "source")
     asked = ["method=paper", "method.n=32", "method.hypotheses=5", "gap=1", f"out={folder / 'set'}", "--quiet"]
