@@ -121,6 +121,10 @@ class FitOptions:
     #: Source: origin not recorded.
     steps: int = 6
 
+    #: Blocks of near tracks (across, down) from whose scatter the covariance is enlarged, a count; None = not at all.
+    #: Source: docs/uncertainty.md, "What was tried".
+    blocks: tuple[int, int] | None = None
+
 
 class MapSolution(NamedTuple):
     """The unknowns at the optimum, and the noise and weights of the cost that they minimise."""
@@ -269,7 +273,11 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     than assumed enlarge the covariance. A shutter rate that was not accepted is still unknown: it has its prior's
     freedom here.
 
-    Source: P. Huber, "Robust Statistics", 1981, section 7.6.
+    Where neighbouring near tracks share their errors, the sandwich is too small. With ``blocks`` it is multiplied by
+    the ratio of the scatter of the unknowns when one block of near tracks after the other is left out.
+
+    Source: P. Huber, "Robust Statistics", 1981, section 7.6; of the blocks H. Künsch, "The jackknife and the bootstrap
+    for general stationary observations", 1989, with a linear step in place of a new solution.
     """
     linear = linearise_tracks(problem, solution.at)
     square = squared_residuals(problem, linear, solution.noise)
@@ -289,7 +297,50 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     A, M = A + prior, M + prior
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
     whole = small_matmul(small_matmul(inverse, M), inverse)
-    return 0.5 * (whole + whole.transpose(1, 2)), ok
+    whole = 0.5 * (whole + whole.transpose(1, 2))
+    if o.blocks is not None:
+        used = problem.near & linear.front
+        steps = _steps_without_blocks(rows, bread, weight, _blocks_of(problem.ray, used, *o.blocks), solution)
+        whole = whole * _scatter_ratio(steps, whole, ok, solution)[:, None, None]
+    return whole, ok
+
+
+def _blocks_of(ray: Tensor, used: Tensor, across: int, down: int) -> Tensor:
+    """Membership (B, K, N) in K = across · down blocks of equally many used tracks: columns by x, each parted by y."""
+
+    def parts(x: Tensor, mask: Tensor, n: int) -> Tensor:
+        """Part 0 … n - 1 of the masked tracks by rising x."""
+        rank = torch.where(mask, x, torch.inf).argsort(dim=-1, stable=True).argsort(dim=-1, stable=True)
+        return (rank * n // mask.sum(-1, keepdim=True).clamp_min(1)).clamp(max=n - 1)
+
+    x, y = (ray[:, :2] / ray[:, 2:]).unbind(1)
+    column = parts(x, used, across)
+    columns = [used & (column == k) for k in range(across)]
+    return torch.stack([mask & (parts(y, mask, down) == k) for mask in columns for k in range(down)], 1)
+
+
+def _steps_without_blocks(rows: Tensor, bread: Tensor, weight: Tensor, blocks: Tensor, solution: MapSolution) -> Tensor:
+    """Steps (B, K, 9) of the unknowns to where they would be without one block of near tracks, to first order."""
+    prior = torch.diag_embed(shutter_prior(solution.shutter_precision.double()))
+    whole = normal_equations(rows, bread.double(), block=SUM_LANES)[0] + prior
+    parts, slopes = [], []
+    for member in blocks.double().unbind(1):
+        parts.append(normal_equations(rows, bread * member, block=SUM_LANES)[0])
+        slopes.append(normal_equations(rows, weight * member, block=SUM_LANES)[1])
+    rest = whole[:, None] - torch.stack(parts, 1)
+    steps, _ = solve_spd(rest.flatten(0, 1), torch.stack(slopes, 1).flatten(0, 1)[..., None])
+    return steps.unflatten(0, rest.shape[:2])[..., 0]
+
+
+def _scatter_ratio(steps: Tensor, covariance: Tensor, ok: Tensor, solution: MapSolution) -> Tensor:
+    """Covariance of the delete-block jackknife over the stated one, (B,) and at least 1: mean over the unknowns.
+
+    About 1 where errors of near tracks are independent; larger where neighbours share theirs.
+    """
+    K = steps.shape[1]
+    whitened, _ = solve_spd(torch.where(ok[:, None, None], covariance, torch.eye(9).to(covariance)), steps.mT)
+    n_free = N_POSE_PARAMETERS + 3 * (solution.shutter_precision < GLOBAL_SHUTTER_PRECISION)
+    return ((K - 1) / K * (steps * whitened.mT).sum((1, 2)) / n_free).clamp_min(1.0)
 
 
 def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:

@@ -356,6 +356,7 @@ def map_pose(
     bend: float = FitOptions.bend,
     near_steps: int = FitOptions.near_steps,
     steps: int = FitOptions.steps,
+    blocks: tuple[int, int] | None = FitOptions.blocks,
     threshold_px: float = 3.0,
 ) -> PoseFit:
     """Most probable pose of all tracks: near tracks determine the scale, far tracks, without depth, the rotation.
@@ -383,6 +384,7 @@ def map_pose(
         translation_gain: fraction of the cost of the best pure rotation that the translation must take away.
         kernel, bend: robust kernel and the residual, in standard deviations, at which it bends.
         near_steps, steps: Levenberg–Marquardt steps of the two solutions.
+        blocks: number of blocks of near tracks, across and down, whose scatter enlarges ``cov``; None = independent.
         threshold_px: largest reprojection error of a near track that is reported as an inlier.
 
     Returns:
@@ -436,6 +438,7 @@ def map_pose(
         bend=bend,
         near_steps=near_steps,
         steps=steps,
+        blocks=None if blocks is None else (blocks[0], blocks[1]),
     )
     problem = run_without_grad(_pose_depth_problem, samples, tracks, camera_0, camera_1, isotropic)
     return chunked_apply(

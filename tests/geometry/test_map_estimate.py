@@ -21,6 +21,7 @@ from dhtorch.geometry.map_estimate import (
     estimate_noise_variance,
     pose_covariance,
 )
+from dhtorch.stages.pose import map_pose
 
 D = torch.float64
 
@@ -146,6 +147,26 @@ def test_a_pose_that_is_not_determined_has_no_covariance():
     one = torch.ones(2, dtype=D)
     cov, ok = pose_covariance(tracks, MapSolution(at, noise, one, one, one > 0), FitOptions())
     assert ok.tolist() == [True, False] and cov[0].any() and not cov[1].any()
+
+
+def normalised_square(shared_px, blocks, n=60):
+    """Mean squared error of n poses in standard deviations, per parameter; tracks of a twelfth of the picture share an
+    error of ``shared_px``."""
+    args, T, *_ = map_pose_inputs(n, 160, 0, noise=0.3, depth=0.002, baseline=0.3, seed=5)
+    samples, tracks = args[:2]
+    cell = (tracks.uv_0[..., 0] // 160).clamp(0, 3) * 3 + (tracks.uv_0[..., 1] // 160).clamp(0, 2)
+    field = shared_px * torch.randn(n, 12, 2, generator=torch.Generator().manual_seed(6), dtype=D)
+    shift = field.gather(1, cell.long()[..., None].expand(-1, -1, 2))
+    fit = map_pose(samples, tracks.replace(uv_1=tracks.uv_1 + shift), *args[2:], shutter_sigma=0.0, blocks=blocks)
+    assert fit.ok.all()
+    error = se3.log(se3.compose(fit.T_1_from_0, se3.invert(T)))
+    return float((error * torch.linalg.solve(fit.cov, error)).sum(-1).mean()) / 6
+
+
+def test_blocks_of_near_tracks_enlarge_the_covariance_where_neighbours_share_their_errors():
+    assert normalised_square(0.0, (4, 2)) == pytest.approx(normalised_square(0.0, None), rel=0.3)
+    plain, widened = (normalised_square(0.5, blocks) for blocks in (None, (4, 2)))
+    assert plain > 4 and widened < 0.5 * plain, (plain, widened)
 
 
 # ------------------------------------------------------------------------------------------------ choices
