@@ -171,8 +171,66 @@ def squared_differences(
     source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor
 ) -> Tensor:
     """Sum (M,) of squared grey differences between the windows at ``x`` and ``x + d``, after normalisation."""
+    return _squared_differences(
+        source.levels[0],
+        target.levels[0],
+        x.contiguous(),
+        (x + d).contiguous(),
+        batch,
+        source=source,
+        target=target,
+        o=o,
+    )
+
+
+def _squared_differences_kernel(
+    level_0: Tensor,
+    level_1: Tensor,
+    x: Tensor,
+    y: Tensor,
+    batch: Tensor,
+    *,
+    source: Pyramid,
+    target: Pyramid,
+    o: SearchOptions,
+) -> Tensor:
+    sums = torch.empty_like(x[0])
+    torch.ops.dhtorch.window_differences.default(
+        source=level_0,
+        target=level_1,
+        x=x,
+        y=y,
+        batch=batch,
+        sums=sums,
+        window=o.window,
+        pad=source.pad,
+        margin=OUTSIDE_MARGIN_PX,
+        remove_bias=o.normalise != "none",
+        estimate_gain=o.normalise == "gain_bias",
+        min_gain=CONTRAST_RATIO_RANGE[0],
+        max_gain=CONTRAST_RATIO_RANGE[1],
+    )
+    return sums
+
+
+@operator(
+    kernel=_squared_differences_kernel,
+    dtypes=dict.fromkeys(("level_0", "level_1", "x", "y"), torch.float32) | {"batch": torch.int64},
+)
+def _squared_differences(
+    level_0: Tensor,
+    level_1: Tensor,
+    x: Tensor,
+    y: Tensor,
+    batch: Tensor,
+    *,
+    source: Pyramid,
+    target: Pyramid,
+    o: SearchOptions,
+) -> Tensor:
+    """:func:`squared_differences` between ``x`` and ``y`` (2, M) on the finest levels of the pyramids."""
     sums, size = [], chunk_size(MAX_CHUNK_POINTS, x)
-    for p, q, b in zip(*(y.split(size, -1) for y in (x, x + d, batch)), strict=True):
+    for p, q, b in zip(*(points.split(size, -1) for points in (x, y, batch)), strict=True):
         T = source.windows(0, p, b, o.window, (GREY_PLANE,))[0]
         J = target.windows(0, q, b, o.window, (GREY_PLANE,))[0]
         if o.normalise != "none":

@@ -16,10 +16,6 @@ namespace {
 constexpr int64_t MAX_NODES = 2 * MAX_MAP_RADIUS_PX + 2;  // along a side of the largest map
 static_assert(MAX_NODES * MAX_NODES <= 64);               // one bit each
 
-inline Vector between(Vector a, Vector b, float weight) {  // as torch.lerp
-  return weight < 0.5f ? a + weight * (b - a) : b - (b - a) * (1.0f - weight);
-}
-
 struct Level {
   const float* pixels;
   int64_t planes, rows, width, pad, margin;
@@ -39,71 +35,133 @@ struct Level {
   }
 };
 
-// The window of image 0 as three planes g_x, g_y, T of `size` rows, padded with zeros to whole vectors, after the
-// normalisation; and sums over it: g T, A, T T.
+// Rows of one plane of a level from a window's first pixel on, read between pixels where `exactly`.
 //
 // Rows are read in whole vectors, past their end but not past the image's: a level has more padding than a window reaches.
-struct Window {
-  int64_t size, wide, count;
-  std::vector<float> planes, inside;  // inside: 1 in the window, 0 in the padding
-  Bits last;                          // mask of the lanes of a row's last vector that belong to the window
-  float moments[6];
+template <bool exactly>
+struct Rows {
+  const float* from;
+  int64_t width;
+  float right;
 
-  explicit Window(int64_t size)
-      : size(size), wide((size + LANES - 1) / LANES * LANES), count(size * wide), planes(3 * count), inside(count) {
-    for (int64_t i = 0; i < size; ++i) std::fill_n(inside.data() + i * wide, size, 1.0f);
+  Vector at(int64_t i, int64_t j) const {
+    const float* pixel = from + i * width + j;
+    const Vector here = load(pixel);
+    return exactly ? fused(right, load(pixel + 1) - here, here) : here;
+  }
+};
+
+// Bilinear value between two of its rows.
+inline Vector between(Vector above, Vector below, float down) { return fused(down, below - above, above); }
+
+// Columns of windows of `size` pixels as whole vectors: row length, and the lanes of the last vector within the window.
+struct Columns {
+  int64_t size, wide;
+  Bits last;
+
+  explicit Columns(int64_t size) : size(size), wide((size + LANES - 1) / LANES * LANES) {
     for (int64_t i = 0; i < LANES; ++i) last[i] = wide - LANES + i < size ? -1 : 0;
   }
+  Bits kept(int64_t j) const { return j + LANES < wide ? ~Bits{} : last; }
+};
+
+inline Vector masked(Vector x, Bits kept) { return reinterpret_cast<Vector>(reinterpret_cast<Bits>(x) & kept); }
+
+// The window of image 0 as three planes g_x, g_y, T of `size` rows, padded with zeros to whole vectors, after the
+// normalisation; and sums over it: g T, A, T T.
+struct Window : Columns {
+  int64_t count;
+  std::vector<float> planes;
+  float moments[6];
+
+  explicit Window(int64_t size) : Columns(size), count(size * wide), planes(3 * count) {}
 
   float* plane(int64_t k) { return planes.data() + k * count; }
   const float* plane(int64_t k) const { return planes.data() + k * count; }
 
-  void read(const Level& level, float x, float y, int64_t batch, bool exactly) {
-    const float u = level.corner(x, 0), v = level.corner(y, 1), right = x - u, down = y - v;
-    for (int64_t k = 0; k < 3; ++k) {
-      const float* from = level.at(batch, (k + 1) % 3, u, v, size / 2);
-      for (int64_t j = 0; j < wide; j += LANES) {
-        const Bits kept = j + LANES < wide ? ~Bits{} : last;
-        const auto row = [&](int64_t i) {
-          const float* pixel = from + i * level.width + j;
-          return exactly ? between(load(pixel), load(pixel + 1), right) : load(pixel);
-        };
-        float* to = plane(k) + j;
-        Vector above = row(0);
-        for (int64_t i = 0; i < size; ++i) {
-          const Vector below = row(exactly ? i + 1 : i);
-          const Vector here = exactly ? between(above, below, down) : below;
-          store(reinterpret_cast<Vector>(reinterpret_cast<Bits>(here) & kept), to + i * wide);
-          above = below;
+  // Products of g_x, g_y and T, summed over the window.
+  struct Products {
+    Vector of[6] = {};
+
+    void add(Vector g_x, Vector g_y, Vector T) {
+      of[0] = fused(g_x, T, of[0]);
+      of[1] = fused(g_y, T, of[1]);
+      of[2] = fused(g_x, g_x, of[2]);
+      of[3] = fused(g_y, g_x, of[3]);
+      of[4] = fused(g_y, g_y, of[4]);
+      of[5] = fused(T, T, of[5]);
+    }
+    void sum(float* to) const {
+      totals(of[0], of[1], of[2], of[3], to);
+      to[4] = total(of[4]);
+      to[5] = total(of[5]);
+    }
+  };
+
+  // The window as it is, and its moments.
+  template <bool exactly>
+  void read(const Level& level, float x, float y, int64_t batch) {
+    const float u = level.corner(x, 0), v = level.corner(y, 1), down = y - v;
+    Rows<exactly> rows[3];
+    for (int64_t k = 0; k < 3; ++k) rows[k] = {level.at(batch, (k + 1) % 3, u, v, size / 2), level.width, x - u};
+    Products products;
+    for (int64_t j = 0; j < wide; j += LANES) {
+      const Bits inside = kept(j);
+      Vector above[3];
+      for (int64_t k = 0; k < 3; ++k) above[k] = rows[k].at(0, j);
+      float* to = planes.data() + j;
+      for (int64_t i = 0; i < size; ++i, to += wide) {
+        Vector here[3];
+        for (int64_t k = 0; k < 3; ++k) {
+          const Vector below = rows[k].at(exactly ? i + 1 : i, j);
+          here[k] = masked(exactly ? between(above[k], below, down) : below, inside);
+          above[k] = below;
+          store(here[k], to + k * count);
         }
+        products.add(here[0], here[1], here[2]);
       }
     }
+    products.sum(moments);
   }
 
-  float sum(const float* a, const float* b) const {
-    Vector sums = {};
-    for (int64_t i = 0; i < count; i += LANES) sums += load(a + i) * load(b + i);
-    return total(sums);
-  }
-
-  void subtract(float* __restrict from, const float* __restrict what, float share) {
-    for (int64_t i = 0; i < count; ++i) from[i] -= share * what[i];
+  // Subtract from each plane what `change` says of its values; and the moments of the result.
+  template <typename Change>
+  void subtract(const Change& change) {
+    Products products;
+    for (int64_t j = 0; j < wide; j += LANES) {
+      const Bits inside = kept(j);
+      for (float* at = planes.data() + j; at < planes.data() + count; at += wide) {
+        Vector here[3] = {load(at), load(at + count), load(at + 2 * count)};
+        change(here);
+        for (int64_t k = 0; k < 3; ++k) {
+          here[k] = masked(here[k], inside);
+          store(here[k], at + k * count);
+        }
+        products.add(here[0], here[1], here[2]);
+      }
+    }
+    products.sum(moments);
   }
 
   void project(bool remove_bias, bool estimate_gain) {
     if (remove_bias) {
+      float mean[3];
       for (int64_t k = 0; k < 3; ++k) {
-        const float mean = sum(plane(k), inside.data()) / static_cast<float>(size * size);
-        subtract(plane(k), inside.data(), mean);
+        Vector sum = {};
+        for (int64_t i = 0; i < count; i += LANES) sum += load(plane(k) + i);
+        mean[k] = total(sum) / static_cast<float>(size * size);
       }
+      subtract([&](Vector* here) {
+        for (int64_t k = 0; k < 3; ++k) here[k] -= mean[k];
+      });
     }
-    float *g_x = plane(0), *g_y = plane(1), *T = plane(2);
-    moments[5] = sum(T, T);
     if (estimate_gain) {
-      for (float* g : {g_x, g_y}) subtract(g, T, sum(g, T) / (moments[5] > 0.0f ? moments[5] : 1.0f));
+      const float energy = moments[5], by = energy > 0.0f ? energy : 1.0f, slope[2] = {moments[0] / by, moments[1] / by};
+      subtract([&](Vector* here) {
+        for (int64_t k = 0; k < 2; ++k) here[k] -= slope[k] * here[2];
+      });
+      moments[5] = energy;
     }
-    const float found[5] = {sum(g_x, T), sum(g_y, T), sum(g_x, g_x), sum(g_y, g_x), sum(g_y, g_y)};
-    std::copy_n(found, 5, moments);
   }
 };
 
@@ -114,30 +172,40 @@ struct Map {
   const Window& window;
   const float *inverse, *moments, *J;
   int64_t stride, n;
-  uint64_t known = 0;  // one bit per node
-  float field[K * MAX_NODES * MAX_NODES];
+  uint64_t known;  // one bit per node
+  float field[K * MAX_NODES * MAX_NODES];  // of known nodes
 
-  // R x M nodes, the first at row v and column u.
+  Map(const Window& window, const float* inverse, const float* J, int64_t stride, int64_t n)
+      : window(window), inverse(inverse), moments(window.moments), J(J), stride(stride), n(n), known(0) {}
+
+  // R x M nodes, the first at row v and column u. Few nodes have a sum for each of a row's first vectors, which does not
+  // wait for the one before.
   template <int R, int M>
   void correlate(int64_t v, int64_t u) {
-    Vector sums[K][R][M] = {};
+    constexpr int64_t CHAINS = R * M * K > 4 ? 1 : 2;
+    Vector sums[CHAINS][K * R * M] = {};
     for (int64_t i = 0; i < window.size; ++i) {
       for (int64_t j = 0; j < window.wide; j += LANES) {
+        Vector* to = sums[CHAINS > 1 && j ? 1 : 0];
         Vector own[K];
         for (int k = 0; k < K; ++k) own[k] = load(window.plane(k) + i * window.wide + j);
         for (int r = 0; r < R; ++r) {
           for (int m = 0; m < M; ++m) {
             const Vector there = load(J + (i + v + r) * stride + j + u + m);
-            for (int k = 0; k < K; ++k) sums[k][r][m] += own[k] * there;
+            for (int k = 0; k < K; ++k) to[(k * R + r) * M + m] = fused(own[k], there, to[(k * R + r) * M + m]);
           }
         }
       }
     }
+    Vector all[(K * R * M + 3) / 4 * 4] = {};
+    float C[(K * R * M + 3) / 4 * 4];
+    for (int k = 0; k < K * R * M; ++k) all[k] = CHAINS > 1 ? sums[0][k] + sums[CHAINS - 1][k] : sums[0][k];
+    for (int k = 0; k < K * R * M; k += 4) totals(all[k], all[k + 1], all[k + 2], all[k + 3], C + k);
     for (int r = 0; r < R; ++r) {
       for (int m = 0; m < M; ++m) {
-        float C[K];
-        for (int k = 0; k < K; ++k) C[k] = total(sums[k][r][m]);
-        put((v + r) * n + u + m, C);
+        float own[K];
+        for (int k = 0; k < K; ++k) own[k] = C[(k * R + r) * M + m];
+        put((v + r) * n + u + m, own);
       }
     }
   }
@@ -150,35 +218,46 @@ struct Map {
     known |= uint64_t{1} << node;
   }
 
-  // Nodes of two rows and columns, or one at a border.
-  void ensure(int64_t v, int64_t last_v, int64_t u, int64_t last_u) {
-    const bool square = last_v > v && last_u > u;
-    const uint64_t two = uint64_t{3} << (v * n + u), four = two | two << n;
-    if (square && !(known & four)) return correlate<2, 2>(v, u);
-    if (square && (known & four) == four) return;
-    for (int64_t i = v; i <= last_v; ++i) {
-      for (int64_t j = u; j <= last_u; ++j) {
-        if (!(known >> (i * n + j) & 1)) correlate<1, 1>(i, j);
-      }
-    }
+  // Four nodes, the first at row v and column u: those that are unknown, one or two of a row or column, else all.
+  void ensure_four(int64_t v, int64_t u) {
+    const uint64_t at = known >> (v * n + u), below = at >> n;
+    const uint64_t have = (at & 3) | (below & 3) << 2;
+    if (have == 15) return;
+    if (have == 3) return correlate<1, 2>(v + 1, u);
+    if (have == 12) return correlate<1, 2>(v, u);
+    if (have == 5) return correlate<2, 1>(v, u + 1);
+    if (have == 10) return correlate<2, 1>(v, u);
+    if (have == 14) return correlate<1, 1>(v, u);
+    if (have == 13) return correlate<1, 1>(v, u + 1);
+    if (have == 11) return correlate<1, 1>(v + 1, u);
+    if (have == 7) return correlate<1, 1>(v + 1, u + 1);
+    correlate<2, 2>(v, u);
   }
 
   // Bilinear interpolation of the field, which is zero beyond its border.
   void interpolate(const float* p, float* found) {
-    const float u = std::floor(p[0]), v = std::floor(p[1]);
+    const float u = std::floor(p[0]), v = std::floor(p[1]), last = static_cast<float>(n - 1);
+    if (!(u >= 0.0f && v >= 0.0f && u < last && v < last)) return interpolate_border(p, u, v, found);
+    const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
+    ensure_four(row, column);
+    const float right = p[0] - u, down = p[1] - v, left = 1.0f - right, up = 1.0f - down;
+    for (int k = 0; k < K; ++k) {
+      const float* at = field + (k * n + row) * n + column;
+      found[k] = (at[0] * left + at[1] * right) * up + (at[n] * left + at[n + 1] * right) * down;
+    }
+  }
+
+  void interpolate_border(const float* p, float u, float v, float* found) {
     std::fill_n(found, K, 0.0f);
     if (!(u >= -1.0f && v >= -1.0f && u < static_cast<float>(n) && v < static_cast<float>(n))) return;
     const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
     const int64_t first[2] = {std::max<int64_t>(column, 0), std::max<int64_t>(row, 0)};
     const int64_t last[2] = {std::min(column + 1, n - 1), std::min(row + 1, n - 1)};
-    ensure(first[1], last[1], first[0], last[0]);
-    for (int k = 0; k < K; ++k) {
-      for (int64_t i = first[1]; i <= last[1]; ++i) {
-        float along = 0.0f;
-        for (int64_t j = first[0]; j <= last[0]; ++j) {
-          along += field[(k * n + i) * n + j] * (1.0f - std::abs(p[0] - static_cast<float>(j)));
-        }
-        found[k] += along * (1.0f - std::abs(p[1] - static_cast<float>(i)));
+    for (int64_t i = first[1]; i <= last[1]; ++i) {
+      for (int64_t j = first[0]; j <= last[0]; ++j) {
+        if (!(known >> (i * n + j) & 1)) correlate<1, 1>(i, j);
+        const float weight = (1.0f - std::abs(p[0] - static_cast<float>(j))) * (1.0f - std::abs(p[1] - static_cast<float>(i)));
+        for (int k = 0; k < K; ++k) found[k] += field[(k * n + i) * n + j] * weight;
       }
     }
   }
@@ -220,7 +299,7 @@ template <int K>
 void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const Options& o, State& s) {
   const float start[2] = {x[0] + s.d[0] - corner[0], x[1] + s.d[1] - corner[1]};
   float p[2] = {start[0], start[1]}, step[2] = {0.0f, 0.0f}, square = 0.0f;
-  for (int64_t k = 1; k <= steps; ++k) {
+  for (int64_t k = 1; s.live && k <= steps; ++k) {
     const float last[2] = {step[0], step[1]};
     float found[K];
     map.interpolate(p, found);
@@ -237,7 +316,7 @@ void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const
     p[0] -= step[0];
     p[1] -= step[1];
   }
-  if (!s.live || !std::isfinite(p[0]) || !std::isfinite(p[1])) std::copy_n(start, 2, p);
+  if (!std::isfinite(p[0]) || !std::isfinite(p[1])) std::copy_n(start, 2, p);
   const float side = static_cast<float>(map.n - 1);
   s.held = p[0] >= 0.0f && p[0] <= side && p[1] >= 0.0f && p[1] <= side;
   const float place[2] = {p[0] + corner[0], p[1] + corner[1]};
@@ -254,19 +333,38 @@ bool finite(const float* from, int64_t stride, int64_t rows, int64_t columns) {
   return total(nothing) == 0.0f;
 }
 
+// The other image: its level, and which of its pictures are known to be finite, so that no patch of them is tested.
+struct Target {
+  Level level;
+  std::vector<float> patch;  // a patch without what is beside it
+  std::vector<bool> clean;
+
+  Target(const Level& level, int64_t batch, int64_t points, const Columns& window)
+      : level(level), patch((window.size + MAX_NODES) * (window.wide + LANES)), clean(batch) {
+    const int64_t pixels = level.rows * level.width;
+    if (points * static_cast<int64_t>(patch.size()) < batch * pixels) return;  // few points: their patches are less to test
+    for (int64_t b = 0; b < batch; ++b) {
+      const float* first = level.pixels + b * level.planes * pixels;
+      clean[b] = finite(first, 0, 1, pixels - LANES + 1) && finite(first + pixels - LANES, 0, 1, LANES);
+    }
+  }
+};
+
 // One map of radius (n - 2) / 2 around a point's position, and the steps on it.
 template <int K>
-void on_map(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch, int64_t n,
-            const float* x, int64_t steps, const Options& o, State& s) {
+void on_map(Window& window, const float* inverse, Target& target, int64_t batch, int64_t n, const float* x, int64_t steps,
+            const Options& o, State& s) {
+  const Level& level = target.level;
   const float radius = static_cast<float>((n - 2) / 2);
-  const float corner[2] = {target.corner(x[0] + s.d[0], 0) - radius, target.corner(x[1] + s.d[1], 1) - radius};
+  const float corner[2] = {level.corner(x[0] + s.d[0], 0) - radius, level.corner(x[1] + s.d[1], 1) - radius};
   const int64_t side = window.size + n - 1, stride = window.wide + LANES;
-  Map<K> map{window, inverse, window.moments, target.at(batch, 0, corner[0], corner[1], window.size / 2), target.width, n};
-  if (!finite(map.J, map.stride, side, stride)) {  // perhaps only beside the patch
+  Map<K> map(window, inverse, level.at(batch, 0, corner[0], corner[1], window.size / 2), level.width, n);
+  if (s.live && !target.clean[batch] && !finite(map.J, map.stride, side, stride)) {  // perhaps only beside the patch
+    float* patch = target.patch.data();
     for (int64_t i = 0; i < side; ++i) {
-      std::fill_n(std::copy_n(map.J + i * map.stride, side, &patch[i * stride]), stride - side, 0.0f);
+      std::fill_n(std::copy_n(map.J + i * map.stride, side, patch + i * stride), stride - side, 0.0f);
     }
-    map.J = patch.data();
+    map.J = patch;
     map.stride = stride;
     if (!finite(map.J, map.stride, side, stride)) {  // no step across NaN, as in torch
       std::fill_n(map.field, K * n * n, NAN);
@@ -277,12 +375,12 @@ void on_map(Window& window, const float* inverse, const Level& target, int64_t b
 }
 
 template <int K>
-void search_point(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch,
-                   const float* x, const Tensor& radii, const Options& o, State& s) {
-  for (int64_t k = 0; k < radii.size(0); ++k) {
+void search_point(Window& window, const float* inverse, Target& target, int64_t batch, const float* x, const int64_t* radii,
+                  int64_t maps, const Options& o, State& s) {
+  for (int64_t k = 0; k < maps; ++k) {
     const int64_t steps = std::min(o.steps_per_map, o.iterations - k * o.steps_per_map);
     if (k && (steps <= 0 || !s.live)) return;
-    on_map<K>(window, inverse, target, batch, patch, 2 * data<int64_t>(radii)[k] + 2, x, steps, o, s);
+    on_map<K>(window, inverse, target, batch, 2 * radii[k] + 2, x, steps, o, s);
   }
 }
 
@@ -295,34 +393,99 @@ void lk_level(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Te
               int64_t steps_per_map, int64_t pad, int64_t margin, bool remove_bias, bool estimate_gain, double epsilon,
               double min_eigenvalue, double min_gain, double max_gain, bool finest, int64_t aitken_step, double min_ratio,
               double max_ratio) {
-  const Level here(source, pad, margin), there(target, pad, margin);
+  const Level here(source, pad, margin);
   Options o{iterations, steps_per_map, static_cast<float>(epsilon), min_eigenvalue * static_cast<double>(window * window),
             static_cast<float>(min_gain), static_cast<float>(max_gain), finest, aitken_step,
             static_cast<float>(min_ratio), static_cast<float>(max_ratio), {}, {}};
   std::copy_n(data<float>(limits), 2, o.low);
   std::copy_n(data<float>(limits) + 2, 2, o.high);
-  const int64_t M = x.size(1);
+  const int64_t M = x.size(1), maps = radii.size(0);
+  const float *places = data<float>(x), *begins = data<float>(d);
+  const int64_t *pairs = data<int64_t>(batch), *reach = data<int64_t>(radii);
+  const bool* wanted = data<bool>(known);
+  float *to = data<float>(found), *normal = data<float>(A);
+  bool *on_last = data<bool>(held), *with_texture = data<bool>(textured);
   Window own(window);
-  std::vector<float> patch((window + MAX_NODES) * (own.wide + LANES));
+  Target there(Level(target, pad, margin), target.size(0), M, own);
   for (int64_t m = 0; m < M; ++m) {
-    const float place[2] = {data<float>(x)[m], data<float>(x)[M + m]};
-    const int64_t b = data<int64_t>(batch)[m];
-    State s{{data<float>(d)[m], data<float>(d)[M + m]}, data<bool>(known)[m], false};
-    own.read(here, place[0], place[1], b, finest);
+    const float place[2] = {places[m], places[M + m]};
+    const int64_t b = pairs[m];
+    State s{{begins[m], begins[M + m]}, wanted[m], false};
+    finest ? own.read<true>(here, place[0], place[1], b) : own.read<false>(here, place[0], place[1], b);
     own.project(remove_bias, estimate_gain);
     float inverse[3];
     const bool fine = invert(own.moments + 2, o.min_eigenvalue, inverse);
     const float begun[2] = {place[0] + s.d[0], place[1] + s.d[1]};
     s.live = s.live && fine && o.within(begun);
     if (estimate_gain) {
-      search_point<3>(own, inverse, there, b, patch, place, radii, o, s);
+      search_point<3>(own, inverse, there, b, place, reach, maps, o, s);
     } else {
-      search_point<2>(own, inverse, there, b, patch, place, radii, o, s);
+      search_point<2>(own, inverse, there, b, place, reach, maps, o, s);
     }
-    for (int axis = 0; axis < 2; ++axis) data<float>(found)[axis * M + m] = s.d[axis];
-    for (int k = 0; k < 3; ++k) data<float>(A)[k * M + m] = own.moments[2 + k];
-    data<bool>(held)[m] = s.held;
-    data<bool>(textured)[m] = fine;
+    for (int axis = 0; axis < 2; ++axis) to[axis * M + m] = s.d[axis];
+    for (int k = 0; k < 3; ++k) normal[k * M + m] = own.moments[2 + k];
+    on_last[m] = s.held;
+    with_texture[m] = fine;
+  }
+}
+
+// A window between pixels in rows of whole vectors, padded with zeros; returns its sum.
+float read_plane(const Level& level, const Columns& columns, const float* x, int64_t batch, float* to) {
+  const float u = level.corner(x[0], 0), v = level.corner(x[1], 1), down = x[1] - v;
+  const Rows<true> rows{level.at(batch, 0, u, v, columns.size / 2), level.width, x[0] - u};
+  Vector sum = {};
+  for (int64_t j = 0; j < columns.wide; j += LANES) {
+    Vector above = rows.at(0, j);
+    for (int64_t i = 0; i < columns.size; ++i) {
+      const Vector below = rows.at(i + 1, j), here = masked(between(above, below, down), columns.kept(j));
+      store(here, to + i * columns.wide + j);
+      sum += here;
+      above = below;
+    }
+  }
+  return total(sum);
+}
+
+// source and target (B, ., ., .), x and y (2, M) positions on them, float32; batch (M) int64. Output: sums (M) of squared
+// differences of the windows at x and y, after the normalisation; window² where it is not finite.
+void window_differences(Tensor source, Tensor target, Tensor x, Tensor y, Tensor batch, Tensor sums, int64_t window,
+                        int64_t pad, int64_t margin, bool remove_bias, bool estimate_gain, double min_gain,
+                        double max_gain) {
+  const Level here(source, pad, margin), there(target, pad, margin);
+  const Columns columns(window);
+  const int64_t M = x.size(1), count = window * columns.wide;
+  const float *places = data<float>(x), *others = data<float>(y), size = static_cast<float>(window * window);
+  const int64_t* pairs = data<int64_t>(batch);
+  float* to = data<float>(sums);
+  std::vector<float> T(count), J(count);
+  for (int64_t m = 0; m < M; ++m) {
+    const float from[2] = {places[m], places[M + m]}, at[2] = {others[m], others[M + m]};
+    const float sum = read_plane(here, columns, from, pairs[m], T.data()), other = read_plane(there, columns, at, pairs[m], J.data());
+    const float mean = remove_bias ? sum / size : 0.0f, other_mean = remove_bias ? other / size : 0.0f;
+    const auto each = [&](const auto& take) {  // T and J without their means
+      for (int64_t i = 0; i < count; i += columns.wide) {
+        for (int64_t j = 0; j < columns.wide; j += LANES) {
+          const Bits inside = columns.kept(j);
+          take(masked(load(&T[i + j]) - mean, inside), masked(load(&J[i + j]) - other_mean, inside));
+        }
+      }
+    };
+    Vector squares = {}, product = {}, energy = {};
+    float by = 1.0f;
+    if (estimate_gain) {
+      each([&](Vector t, Vector j) {
+        product = fused(t, j, product);
+        energy = fused(t, t, energy);
+      });
+      const float all = total(energy), gain = all > 0.0f ? total(product) / all : 1.0f;
+      by = 1.0f / std::clamp(gain, static_cast<float>(min_gain), static_cast<float>(max_gain));
+    }
+    each([&](Vector t, Vector j) {
+      const Vector rest = fused(by, j, -t);
+      squares = fused(rest, rest, squares);
+    });
+    const float all = total(squares);
+    to[m] = std::isfinite(all) ? all : size;
   }
 }
 
@@ -335,6 +498,12 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "int steps_per_map, int pad, int margin, bool remove_bias, bool estimate_gain, float epsilon, "
       "float min_eigenvalue, float min_gain, float max_gain, bool finest, int aitken_step, float min_ratio, "
       "float max_ratio) -> ()");
+  m.def(
+      "window_differences(Tensor source, Tensor target, Tensor x, Tensor y, Tensor batch, Tensor(a!) sums, int window, int pad, "
+      "int margin, bool remove_bias, bool estimate_gain, float min_gain, float max_gain) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("lk_level", TORCH_BOX(&lk_level)); }
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("lk_level", TORCH_BOX(&lk_level));
+  m.impl("window_differences", TORCH_BOX(&window_differences));
+}

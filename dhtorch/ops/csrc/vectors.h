@@ -10,6 +10,10 @@
 
 #include "constants.h"
 
+#if defined(__FMA__)
+#include <immintrin.h>
+#endif
+
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
 #define DHTORCH_SHUFFLES
@@ -50,6 +54,18 @@ inline float fused(float a, float b, float c) {
 #endif
 }
 
+// The same for vectors.
+inline Vector fused(Vector a, Vector b, Vector c) {
+#if defined(__AVX512F__)
+  return reinterpret_cast<Vector>(_mm512_fmadd_ps(reinterpret_cast<__m512>(a), reinterpret_cast<__m512>(b), reinterpret_cast<__m512>(c)));
+#elif defined(__FMA__)
+  return reinterpret_cast<Vector>(_mm256_fmadd_ps(reinterpret_cast<__m256>(a), reinterpret_cast<__m256>(b), reinterpret_cast<__m256>(c)));
+#else
+  return a * b + c;
+#endif
+}
+inline Vector fused(float a, Vector b, Vector c) { return fused(Vector{} + a, b, c); }
+
 // x / DIVISOR, correctly rounded, faster than a division. Exact for integers up to 255 over 255, 25 * 255 over 25, 255000
 // over 255000 and 65535 over 1000.
 template <int DIVISOR>
@@ -83,6 +99,33 @@ inline float total(Vector x) {
     for (int64_t i = 0; i < half; ++i) part[i] += part[i + half];
   }
   return part[0];
+#endif
+}
+
+// Sums of the lanes of four vectors, each as total().
+inline void totals(Vector a, Vector b, Vector c, Vector d, float* to) {
+#ifdef DHTORCH_SHUFFLES
+#ifdef __AVX512F__
+  const auto ab = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+                  __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+  const auto cd = __builtin_shufflevector(c, d, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+                  __builtin_shufflevector(c, d, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+  const auto fours = __builtin_shufflevector(ab, cd, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
+                     __builtin_shufflevector(ab, cd, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+  const auto ac = __builtin_shufflevector(fours, fours, 0, 1, 2, 3, 8, 9, 10, 11),
+             bd = __builtin_shufflevector(fours, fours, 4, 5, 6, 7, 12, 13, 14, 15);
+#else
+  const auto ac = __builtin_shufflevector(a, c, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(a, c, 4, 5, 6, 7, 12, 13, 14, 15),
+             bd = __builtin_shufflevector(b, d, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(b, d, 4, 5, 6, 7, 12, 13, 14, 15);
+#endif
+  const auto twos = __builtin_shufflevector(ac, bd, 0, 1, 8, 9, 4, 5, 12, 13) + __builtin_shufflevector(ac, bd, 2, 3, 10, 11, 6, 7, 14, 15);
+  const auto found = __builtin_shufflevector(twos, twos, 0, 2, 4, 6) + __builtin_shufflevector(twos, twos, 1, 3, 5, 7);
+  std::memcpy(to, &found, sizeof(found));
+#else
+  to[0] = total(a);
+  to[1] = total(b);
+  to[2] = total(c);
+  to[3] = total(d);
 #endif
 }
 
