@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import is_estimated
+from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
@@ -107,7 +108,6 @@ def depth_step_rel(
     depth: Tensor,  # (B, h, w) m, 0 = none
 ) -> Tensor:
     """Farthest over nearest depth in 3×3 pixels, minus one, (B, h, w); pixels without depth do not count."""
-    far = torch.nn.functional.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
+    far = window_extreme(depth, 1, torch.maximum)
     inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
-    near = torch.nn.functional.max_pool2d(inverse[:, None], 3, 1, 1)[:, 0]
-    return far * near - 1
+    return far * window_extreme(inverse, 1, torch.maximum) - 1

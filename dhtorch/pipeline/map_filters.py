@@ -186,13 +186,18 @@ def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     step = torch.maximum(q - q / ratio, options.step_sigmas * sigma)
     edge = swept & (q - farthest > step)
     b, y, x = _pixels(edge)
-    depths, shades = (F.pad(v, (r,) * 4) for v in (q, grey))
+    padded = [F.pad(v, (r,) * 4) for v in (q, grey)]
+    rows, columns = padded[0].shape[1:]
+    depths, shades = (v.flatten() for v in padded)
+    first = (b * rows + y) * columns + x  # upper left pixel of the window
     own, shade = q[b, y, x], grey[b, y, x]
     near, far, n_near, n_far = (torch.zeros_like(own) for _ in range(4))
     for dy, dx in _window(r):
-        other = depths[b, y + dy, x + dx]
-        alike = 1 / (1 + ((shades[b, y + dy, x + dx] - shade) / options.grey_similarity).square())
-        is_near, is_far = other * ratio > own, (other > 0) & (other * ratio < own)
+        place = first + (dy * columns + dx)
+        other = depths[place]
+        alike = 1 / (1 + ((shades[place] - shade) / options.grey_similarity).square())
+        scaled = other * ratio
+        is_near, is_far = scaled > own, (other > 0) & (scaled < own)
         near, n_near = near + alike * is_near, n_near + is_near
         far, n_far = far + alike * is_far, n_far + is_far
     out = torch.zeros_like(swept)
