@@ -10,6 +10,7 @@ import torch
 
 from dhtorch.data import pairs
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
+from dhtorch.data.rig import join_cameras
 from dhtorch.data.scene import Scene, Scenes, scenes_of
 from dhtorch.records import Frame, Pose
 
@@ -195,3 +196,17 @@ def test_where_no_step_fits_the_nearest_frame_is_offered() -> None:
         pairs.candidate_frames(line(1), 0)
     with pytest.raises(ValueError, match="frame 9 of line"):
         pairs.candidate_frames(line(4), 9)
+
+
+def test_frames_of_three_cameras_are_those_of_their_instants():
+    rig = join_cameras([line(4, name=name, camera_name=name) for name in ("a", "b", "c")])
+    assert [tuple(pair) for pair in pairs.by_cameras(rig)][:4] == [(0, (1, 2)), (1, (0, 2)), (2, (0, 1)), (3, (4, 5))]
+    past = pairs.by_cameras(rig, instants=[1], reference="b", past=True)
+    assert [tuple(pair) for pair in past] == [(3 * k + 1, (3 * k - 3, 3 * k - 2, 3 * k - 1)) for k in (1, 2, 3)]
+    (both,) = [pair for pair in pairs.by_cameras(rig, instants=[1], reference="c") if pair.reference == 5]
+    assert both.candidates == (0, 1, 2, 6, 7, 8)
+
+
+@pytest.mark.parametrize(("factor", "gap"), [(0.5, 2), (0.1, 1), (2.0, 6), (1.4, 4)])
+def test_a_scaled_gap_is_rounded_and_at_least_1(factor, gap):
+    assert tuple(pairs.by_scaled_gap(Scene(line(12), gap=3), factor, stride=1)[0]) == (0, gap)

@@ -1,6 +1,7 @@
 """Doubts about stored depth: gross errors of unit, bytes and meaning are found, sound depth is not doubted."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,7 @@ def test_millimetres_as_metres_are_doubted_and_metres_of_a_street_are_not(codes)
 def test_swapped_bytes_are_found(codes):
     ((code, text, remedy),) = found([swap_bytes(c) for c in codes], MM)
     assert code == "byte_order" and "other byte order" in text and "swap" in remedy
+    assert float(re.search(r"differ (\d+) times as much", text).group(1)) > 1
 
 
 def test_codes_rotated_by_three_bits_are_found_unless_the_unit_is_stated(codes):
