@@ -6,20 +6,23 @@ Every fault hits ``dhtorch extract``, ``enrich`` (two workers each) and ``comple
 from the seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody
 disturbed: ``lost``, ``doubled`` and ``changed`` files, and unfinished files and processes ``left`` behind. Of two that
 race, each must be right or refused in one line, else it is ``unclear``; the files of one that succeeded are compared
-before the further run, too. Last, files of others are put beside the outputs and the command is run once more:
-``deleted`` counts those that are gone or changed. Each of these must be 0. Commands are forked off a process that has
-imported what they need, so that faults hit work, not imports.
+before the further run, too. Before that run, files of others are put beside the outputs wherever the folder bears the
+record of the first run: ``deleted`` counts those that are gone or changed after it. Each of these must be 0. Commands
+are forked off a process that has imported what they need, so that faults hit work, not imports.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
+import importlib
 import os
 import random
 import resource
 import shutil
 import signal
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -48,8 +51,11 @@ COMMANDS = {
     "enrich": (*ROOM, "workers=2", "shard_rows=1", "report=false", "dense={planes: 8}"),
     "complete": (*ROOM, "planes=8", "refinements=1", "steps=[1]", "figures=false"),
 }
+#: What shows that a folder is a command's, to which it then comes back although others have put files there.
+RECORDS = {"extract": ".", "enrich": "meta/dhtorch.json", "complete": "complete.json"}
 LOSSES = "lost", "doubled", "changed", "left", "unclear", "deleted"
 FORK = get_context("fork")
+OTHERS = b"mine"
 PATIENCE_S = 5  # after which a process that lives on is left behind
 
 Row = dict[str, str | int]
@@ -60,11 +66,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", default=",".join(COMMANDS), help="separated by commas")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(argv)
     rows: list[Row] = []
+    commands = options.commands.split(",")
     with tempfile.TemporaryDirectory(prefix="dhtorch-kills-") as place:
-        for command in COMMANDS:
+        for command in commands:
             rows += suffered(command, Path(place) / command, options)
     bad = sum(int(row[loss]) for row in rows for loss in LOSSES)
     print(f"{bad} lost, doubled, changed, left, unclear or deleted")
@@ -75,12 +83,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row]:
     """What every fault, so many times, costs one command; ``hit``: how often it ended the command early."""
-    draw, began = random.Random(options.seed), time.monotonic()
+    draw = random.Random(options.seed)
     rows: list[Row] = []
+    place.mkdir()
+    import_what_is_needed(command, place)
+    began = time.monotonic()
     whole = start(command, place / "whole")
     whole.join()
     if whole.exitcode:
-        raise SystemExit(f"dhtorch {command}: fails undisturbed")
+        message = _messages(place / "whole", cast("int", whole.pid)).read_text(encoding="utf-8")
+        raise SystemExit(f"dhtorch {command}: fails undisturbed: {message}")
     took, want, source = time.monotonic() - began, contents(place / "whole"), _checkout()
     for name, fault in FAULTS.items():
         counts = Counter(dict.fromkeys(("hit", *LOSSES), 0))
@@ -93,16 +105,38 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
                 counts["unclear"] += sum(not _is_clear(folder, process) for process in processes)
                 if not all(process.exitcode for process in processes):
                     counts.update(difference(want, contents(folder)))
+            others = put_others(folder) if (folder / RECORDS[command]).exists() else []
             start(command, folder).join()
+            counts["deleted"] += sum(not file.is_file() or file.read_bytes() != OTHERS for file in others)
+            for file in others:
+                file.unlink(missing_ok=True)
             counts.update(difference(want, contents(folder)))
             counts["left"] += len(unfinished(folder))
-            counts["deleted"] += deleted(command, folder)
             shutil.rmtree(folder)
         if _checkout() != source:
             raise SystemExit("the checkout changed meanwhile: run it where nobody works")
         rows.append({"name": f"{command}, {name}", "times": options.times, **counts})
         print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
     return rows
+
+
+def import_what_is_needed(command: str, place: Path) -> None:
+    """Import here the modules that a run of the command imports, without any other work of it."""
+    names = place / "modules.txt"
+
+    def scout() -> None:
+        before = set(sys.modules)
+        try:
+            _run(command, place / "scout", None)
+        finally:
+            names.write_text("\n".join(name for name in sys.modules if name not in before), encoding="utf-8")
+
+    process = FORK.Process(target=scout)
+    process.start()
+    process.join()
+    for name in names.read_text(encoding="utf-8").splitlines():
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
 
 
 def _checkout() -> str:
@@ -203,14 +237,14 @@ def unfinished(folder: Path) -> list[Path]:
     return [f for f in files if f != manifest and (f.name.startswith(".") or is_private(f.relative_to(folder)))]
 
 
-def deleted(command: str, folder: Path) -> int:
-    """How many files of others a further run removes or changes; they are put beside all outputs."""
-    folders = [place for place in (folder, *folder.rglob("*")) if place.is_dir() and place.name != PRIVATE_FOLDER]
-    others = [place / name for place in folders for name in ("mine.png", ".mine.tmp", "mine.parquet")]
+def put_others(folder: Path) -> list[Path]:
+    """Write files that are not dhtorch's beside all outputs -> their paths."""
+    folders = [place for place in (folder, *folder.rglob("*")) if place.is_dir()]
+    folders = [place for place in folders if not is_private(place.relative_to(folder))]
+    others = [place / name for place in folders for name in ("mine.png", ".mine.tmp", "mine.json")]
     for file in others:
-        file.write_bytes(b"mine")
-    start(command, folder).join()
-    return sum(not file.is_file() or file.read_bytes() != b"mine" for file in others)
+        file.write_bytes(OTHERS)
+    return others
 
 
 def contents(folder: Path) -> dict[str, str]:
