@@ -167,6 +167,7 @@ class CameraPin:
         near = textured & self.places.usable & ((self.places.flag & Flag.DEPTH_EDGE) == 0)
         self.metric = int(near.sum()) >= MIN_METRIC_PLACES
         self.known = near if self.metric else textured  # (1, N) places that are followed
+        self.uv = self._leave_out(~self.known)
         self.ray = cam.rays(frame.camera, self.places.uv).double().mT.contiguous()
         xyz = torch.where(near[..., None], self.places.xyz, 1.0).double().mT.contiguous()
         self.points = xyz if self.metric else self.ray  # (1, 3, N)
@@ -176,6 +177,10 @@ class CameraPin:
         self.overlap = max(1.0, PIN_WINDOW_PX / spacing[0]) * max(1.0, PIN_WINDOW_PX / spacing[1])
         column, row = cam.resize_pixels(self.places.uv[0], frame.hw, PIN_GROUPS).round().long().unbind(-1)
         self.group = row * PIN_GROUPS[1] + column
+
+    def _leave_out(self, mask: Tensor) -> Tensor:
+        """Places (1, N, 2) px to track, those of the mask (1, N) outside of the picture, where they cost nothing."""
+        return torch.where(mask[..., None], -2.0 * max(self.frame.hw), self.places.uv)
 
     def _use_capture(self, frames: Frame) -> None:
         """Leave out what moves between the frames; where the camera stood still, take the frames' median."""
@@ -209,8 +214,7 @@ class CameraPin:
                 tracks, seen, fit = again
         if int(fit.inlier.sum()) < ENOUGH_SHARE * n_places:  # the others from where the motion predicts them
             start = cam.project(camera, se3.apply(fit.T, seen.xyz.mT).to(picture))
-            wanted = (self.known & ~fit.inlier)[..., None]
-            uv = torch.where(wanted, self.places.uv, -2.0 * max(self.frame.hw))  # a place outside costs nothing
+            uv = self._leave_out(fit.inlier | ~self.known)
             hint = TrackHint(pyramid=self.pyramid, start=start, levels=PREDICTED_LEVELS)
             seen = self._see(_select_tracks(_TRACKER(self.picture, picture, uv, hint=hint), tracks), camera)
             fit = self._fit(seen, fit.T)
@@ -227,7 +231,7 @@ class CameraPin:
         """Tracks, with options of the tracker, and their motion from a standstill, their median flow, and the best of
         random triples."""
         hint = TrackHint(pyramid=self.pyramid)
-        tracks = _TRACKER(self.picture, picture, self.places.uv, hint=hint, **options)
+        tracks = _TRACKER(self.picture, picture, self.uv, hint=hint, **options)
         seen = self._see(tracks, camera)
         still = se3.identity(1, seen.f)
         starts = [still, motion_fit.rotation_from_flow(seen, self.ray)]
