@@ -42,11 +42,10 @@ def find_change_points(result: PinResult, *, false_alarm_rate: float = 0.01, min
     scatter = whitened.diff(dim=1).abs().median(1, keepdim=True).values / MEDIAN_DIFFERENCE
     whitened = median_of_three(whitened / scatter.clamp_min(1.0))  # at least the stated noise
     offset = median_of_three(offset.mT).mT
-    square_px = result.flow_form[known[0], :free, :free]
     changes: list[ChangePoint] = []
     for low, k, high in mean_changes(whitened, chi2_quantile(1 - false_alarm_rate / max(len(known) - 1, 1), free)):
         change = offset[k:high].mean(0) - offset[low:k].mean(0)
-        shift = float((change @ square_px @ change).sqrt())
+        shift = float((change @ result.flow_form[known[0], :free, :free] @ change).sqrt())
         if shift >= min_px:
             changes.append(ChangePoint(int(known[k]), shift, F.pad(change, (0, 6 - free))))
     return changes

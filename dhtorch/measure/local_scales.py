@@ -132,7 +132,8 @@ def find_faults(
     contrasts = list(_contrasts(local, names))
     if not contrasts or len(np.unique(local.frame)) < 2:
         return [], []
-    columns, log = np.stack([c.column for c in contrasts], 1), np.clip(local.log - np.median(local.log), -1.0, 1.0)
+    columns = np.stack([c.column for c in contrasts], 1)
+    log = np.clip(local.log - np.median(local.log), -1.0, 1.0)
     change, sigma = grouped_slopes(columns, log, np.hypot(local.sigma, LEAST_SIGMA), local.frame, SHARED_NOISE)
     limit = np.where([c.is_part for c in contrasts], tolerance.scan_deviations, tolerance.deviations)
     excess = (np.abs(change) - tolerance.change) / sigma - limit
@@ -165,8 +166,8 @@ def _contrasts(local: LocalScales, names: list[str]) -> Iterator[_Contrast]:
             to = ", ".join(f"{x:+.2f}" for x in axis)
             yield from _gradients(("place", "place"), f"across the model along ({to})", along)
     for kind, where, inside in _parts(local, names):
-        n, n_frames = inside.sum(), len(np.unique(local.frame[inside]))
-        if MIN_RATIOS <= n <= 0.7 * len(inside) and n_frames >= min(3, local.frame.max() + 1):
+        n_frames = len(np.unique(local.frame[inside]))
+        if MIN_RATIOS <= inside.sum() <= 0.7 * len(inside) and n_frames >= min(3, local.frame.max() + 1):
             yield _Contrast(kind, where, inside.astype(float), is_part=True)
 
 

@@ -144,10 +144,9 @@ class CameraPin:
         """
         image = image[None] if image.dim() == 3 else image
         check("CameraPin.check", image=(image, "B C H W"))
-        B, hw = len(image), (image.shape[-2], image.shape[-1])
-        camera = self._live_camera(K, B, hw)
+        camera = self._live_camera(K, len(image), (image.shape[-2], image.shape[-1]))
         picture = grayscale(image).to(self.frame.camera.f)
-        return collate(self._check_one(picture[b : b + 1], camera[b : b + 1]) for b in range(B))
+        return collate(self._check_one(picture[b : b + 1], camera[b : b + 1]) for b in range(len(image)))
 
     def _set_reference(self, frame: Frame, background: Tensor | None) -> None:
         """Choose the places of the reference; ``background`` (N,) keeps only some of them."""

@@ -180,7 +180,8 @@ def metric_scale(
     depth = torch.tensor(np.median(local.depth))
     own = _UNSTATED_SENSOR_SIGMA if sensor is None else float(get_sensor_noise(sensor)(depth) / depth)
     terms = {"frames": scatter, "sensor": own, "model": bend / 12**0.5}
-    scale, sigma = float(np.exp(mean)), float(np.sqrt(sum(term**2 for term in terms.values())))
+    scale = float(np.exp(mean))
+    sigma = float(np.sqrt(sum(term**2 for term in terms.values())))
     of_model = np.stack([model.views[match.view].c2w for match in matches])
     poses = [p.c2w for p in pairs if p.c2w is not None]
     has_poses = len(poses) == len(pairs) >= _MIN_FRAMES

@@ -29,7 +29,8 @@ def align_camera_paths(
     offset = own[:, :3, 3] - turned
     rest = torch.from_numpy(turns @ R.T)
     omega = se3.log(Pose(rest, torch.zeros(len(rest), 3, dtype=torch.float64)))[:, :3].numpy()
-    cov, centre = np.zeros((7, 7)), turned.mean(0)
+    centre = turned.mean(0)
+    cov = np.zeros((7, 7))
     cov[:3, :3], cov[6, 6] = covariance_of_mean(omega), sigma**2
     lever = np.concatenate((se3.hat(torch.from_numpy(centre)).numpy(), np.zeros((3, 3)), -centre[:, None]), 1)
     cov[3:6] = lever @ cov

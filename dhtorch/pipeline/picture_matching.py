@@ -53,7 +53,8 @@ def match_pictures(
     Args:
         pictures, others: number of each picture -> function that loads it, (1, C, H, W).
     """
-    numbers, matches = list(others), list[tuple[int, int, bool]]()
+    numbers = list(others)
+    matches: list[tuple[int, int, bool]] = []
     of_others = torch.stack([_thumbnail(load()) for load in others.values()])
     for k, load in pictures.items():
         picture = load()
