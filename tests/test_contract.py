@@ -733,7 +733,10 @@ ELSEWHERE = {
     "dhtorch.geometry.determinism.round_up",
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.stages.track_chain.{name}" for name in ("frames_between", "images_used")),
-    "dhtorch.geometry.reprojection_problem.pose_normal_equations_at",
+    *(
+        f"dhtorch.geometry.reprojection_problem.{name}"
+        for name in ("pose_normal_equations_at", "minimise_tracks", "noise_from_medians")
+    ),
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"
         for n in (

@@ -252,8 +252,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_squared_differences", ".clamp(*CONTRAST_RATIO_RANGE)[:, None]", "[:, None]"),
         (
             "squared_differences",
-            "x.contiguous(), (x + d).contiguous(), batch",
-            "x.contiguous(), (x - d).contiguous(), batch",
+            "(x + d).contiguous()",
+            "(x - d).contiguous()",
         ),
         ("window_covariance", "torch.stack(adjugate_2x2(a, b, b, c))", "torch.stack(adjugate_2x2(c, b, b, a))"),
         ("window_covariance", "torch.stack(adjugate_2x2(a, b, b, c))", "torch.stack(adjugate_2x2(a, -b, -b, c))"),

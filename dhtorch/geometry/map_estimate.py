@@ -7,17 +7,16 @@ Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import all_known, constant, is_static
+from dhtorch.geometry.checks import all_known, is_static
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.determinism import SUM_LANES, round_up
 from dhtorch.geometry.least_squares import (
-    NormalEquations,
-    minimise,
     normal_equations,
     robust_loss,
     robust_weight_slope,
@@ -29,11 +28,11 @@ from dhtorch.geometry.reprojection_problem import (
     PoseDepthProblem,
     Unknowns,
     linearise_tracks,
-    pose_normal_equations_at,
+    minimise_tracks,
+    noise_from_medians,
     shutter_prior,
     squared_residuals,
     squared_residuals_at,
-    trial_unknowns_step,
     whitened_residuals,
 )
 from dhtorch.geometry.se3 import Pose
@@ -160,8 +159,7 @@ def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> 
     def solve(
         at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: PoseDepthProblem = problem
     ) -> tuple[Unknowns, Tensor]:
-        evaluate, cost = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
-        return minimise(evaluate, at, steps, cost=cost, step=trial_unknowns_step)
+        return minimise_tracks(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend, steps=steps)
 
     half = o.near_steps // 2
     near, _ = solve(at, estimate_noise_variance(near_problem, at), no_far, rigid, half, near_problem)
@@ -213,17 +211,12 @@ def _translates(
     problem: PoseDepthProblem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions
 ) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
-    free = constant(noise, [1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # the least t would be a baseline for a far track
-
-    normal, cost_at = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
-
-    def evaluate(at: Unknowns) -> NormalEquations:
-        cost, H, g = normal(at)
-        return NormalEquations(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
-
-    rotation_start = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
-    rotation_only, rotation_cost = minimise(evaluate, rotation_start, o.steps, cost=cost_at, step=trial_unknowns_step)
-    translates = rotation_cost - cost_at(at) > o.translation_gain * rotation_cost + COST_SLACK
+    solve = partial(minimise_tracks, problem, kernel=o.kernel, bend=o.bend, rotation_only=True)
+    of_tracks = noise, far, precision
+    without_t = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
+    rotation_only, rotation_cost = solve(without_t, *of_tracks, steps=o.steps)  # the least t would be a baseline
+    _, cost = solve(at, *of_tracks, steps=0)
+    translates = rotation_cost - cost > o.translation_gain * rotation_cost + COST_SLACK
     if all_known(translates):
         return translates
     costs = [_costs(problem, x, noise, o) for x in (rotation_only, at)]
@@ -250,17 +243,24 @@ def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int
     Medians do not contain the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
     the previous one.
     """
-    noise = torch.ones_like(problem.inverse)
-    square_of = squared_residuals_at(problem, at)
-    for _ in range(rounds):
-        square, front = square_of(noise)
-        size = square.sqrt()
-        near = masked_median(size, problem.near & front) / MEDIAN_2D
-        far = masked_median(size, problem.far & front) / MEDIAN_1D
-        far = torch.where(problem.far.any(-1, keepdim=True), far, near)
-        factor = torch.where(problem.far, far, near)
-        noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
-    return noise
+
+    limits = MIN_NOISE_PX**2, MAX_NOISE_PX**2
+
+    def reference() -> Tensor:
+        noise = torch.ones_like(problem.inverse)
+        square_of = squared_residuals_at(problem, at)
+        for _ in range(rounds):
+            square, front = square_of(noise)
+            size = square.sqrt()
+            near = masked_median(size, problem.near & front) / MEDIAN_2D
+            far = masked_median(size, problem.far & front) / MEDIAN_1D
+            far = torch.where(problem.far.any(-1, keepdim=True), far, near)
+            factor = torch.where(problem.far, far, near)
+            noise = (noise * factor * factor).clamp(*limits)
+        return noise
+
+    medians = MEDIAN_2D, MEDIAN_1D
+    return noise_from_medians(problem, at, reference=reference, rounds=rounds, medians=medians, limits=limits)
 
 
 @torch.no_grad()

@@ -24,11 +24,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import any_possible, check
+from dhtorch.geometry.checks import any_possible, check, constant
 from dhtorch.geometry.determinism import SUM_LANES
 from dhtorch.geometry.least_squares import (
+    INITIAL_DAMPING,
     MIN_DEPTH,
     NormalEquations,
+    minimise,
     move_pose,
     normal_equations,
     robust_loss,
@@ -285,6 +287,17 @@ _TRACK_DTYPES = {
     )
 }
 
+#: The same of the noise's: which tracks are far in place of its factors.
+_NOISE_DTYPES = {
+    name: torch.bool if name in ("near", "far") else torch.float32
+    for name in (
+        *("ray", "inverse", "near"),
+        *("seen", "shape", "height", "nearest", "variance"),
+        "far",
+        *("R", "t", "shutter_rate"),
+    )
+}
+
 
 def _track_tensors(
     problem: PoseDepthProblem, constants: TrackConstants, factors: tuple[Tensor, Tensor, Tensor], at: Unknowns
@@ -320,6 +333,45 @@ def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Ten
     return _squared_lengths(tracks, (a, b, d)), tracks.front
 
 
+def noise_from_medians(
+    problem: PoseDepthProblem,
+    at: Unknowns,
+    *,
+    reference: Callable[[], Tensor],
+    rounds: int,
+    medians: tuple[float, float],
+    limits: tuple[float, float],
+) -> Tensor:
+    """Variance (B, N) px² of a residual coordinate of near and of far tracks, compiled where it can be.
+
+    Args:
+        problem, at: as in :func:`linearise_tracks`.
+        reference: the same in torch.
+        rounds: of estimates, each from residuals that the one before whitened, the first from unit noise.
+        medians: of the size of near and of far residuals under unit noise.
+        limits: of the variance, px².
+
+    Gradient: none. Raises ValueError for wrong shapes.
+    """
+    c = track_constants(problem)
+    tensors = problem.ray, problem.inverse, problem.near, *c, problem.far, at.T.R, at.T.t, at.shutter_rate
+    return _noise(*tensors, reference=reference, numbers=(rounds, *medians, *limits))
+
+
+def _noise_kernel(*tensors: Any, reference: Callable[[], Tensor], numbers: tuple[float, ...]) -> Tensor:
+    kernel_args = _kernel_arguments(*tensors)
+    noise = torch.empty_like(kernel_args[1])
+    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
+    torch.ops.dhtorch.track_noise.default(*kernel_args, noise, *numbers, *limits)
+    return noise
+
+
+@operator(kernel=_noise_kernel, dtypes=_NOISE_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
+def _noise(*tensors: Any, reference: Callable[[], Tensor], numbers: tuple[float, ...]) -> Tensor:
+    """:func:`noise_from_medians` of tracks and unknowns."""
+    return reference()
+
+
 def _squared_lengths(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     m0, m1 = _whitener(linear, factors)
     return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
@@ -348,6 +400,17 @@ def pose_normal_equations(
     return pose_normal_equations_at(problem, noise, far_weight, shutter_precision, kernel=kernel, bend=bend)[0](at)
 
 
+#: Numbers of the tracks, factors of their noise, and their weights in the cost.
+_Fixed = tuple[TrackConstants, tuple[Tensor, Tensor, Tensor], Tensor]
+
+
+def _fixed_tensors(problem: PoseDepthProblem, noise: Tensor, far_weight: Tensor) -> _Fixed:
+    """What the cost of tracks contains beside the unknowns."""
+    constants = track_constants(problem)
+    share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+    return constants, _noise_factors(constants, noise), share
+
+
 def pose_normal_equations_at(
     problem: PoseDepthProblem,
     noise: Tensor,  # (B, N) px²
@@ -356,14 +419,15 @@ def pose_normal_equations_at(
     *,
     kernel: str | None,
     bend: float,
+    fixed: _Fixed | None = None,
 ) -> tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]:
     """:func:`pose_normal_equations` as a function of the unknowns, and its cost (B,) alone with the same bits.
 
+    ``fixed`` is what :func:`_fixed_tensors` computes, if it is known.
+
     Gradient: as :func:`whitened_residuals`.
     """
-    constants = track_constants(problem)
-    factors = _noise_factors(constants, noise)
-    share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+    constants, factors, share = _fixed_tensors(problem, noise, far_weight) if fixed is None else fixed
 
     def total_cost(cost: Tensor, shutter_rate: Tensor | None) -> Tensor:
         return cost if shutter_rate is None else cost + shutter_precision * (shutter_rate * shutter_rate).sum(-1)
@@ -396,13 +460,85 @@ def pose_normal_equations_at(
     return normal, cost
 
 
+def minimise_tracks(
+    problem: PoseDepthProblem,
+    at: Unknowns,
+    noise: Tensor,  # (B, N) px²
+    far_weight: Tensor,  # (B,)
+    shutter_precision: Tensor,  # (B,) 1/rad²
+    *,
+    kernel: str | None,
+    bend: float,
+    steps: int,
+    rotation_only: bool = False,
+) -> tuple[Unknowns, Tensor]:
+    """Unknowns after ``steps`` of Levenberg–Marquardt on :func:`pose_normal_equations` from ``at``, and their cost.
+
+    With ``rotation_only`` the translation stays as it is. Arguments otherwise as of :func:`pose_normal_equations`.
+
+    Gradient: none. Raises ValueError for wrong shapes or an unknown kernel.
+    """
+    fixed = _fixed_tensors(problem, noise, far_weight)
+
+    def reference() -> tuple[Unknowns, Tensor]:
+        normal, cost = pose_normal_equations_at(
+            problem, noise, far_weight, shutter_precision, kernel=kernel, bend=bend, fixed=fixed
+        )
+
+        def evaluate_rotation(at: Unknowns) -> NormalEquations:
+            value, H, g = normal(at)
+            free = constant(g, ([1.0] * 3 + [0.0] * 3 + [1.0] * 3)[: g.shape[-1]])
+            return NormalEquations(value, H * free * free[:, None] + torch.diag(1 - free), g * free)
+
+        evaluate = evaluate_rotation if rotation_only else normal
+        return minimise(evaluate, at, steps, cost=cost, step=trial_unknowns_step)
+
+    tensors = _track_tensors(problem, *fixed[:2], at)
+    return _minimum(
+        *tensors,
+        fixed[2],
+        shutter_precision,
+        reference=reference,
+        robust=(kernel, bend),
+        options=(steps, rotation_only),
+    )
+
+
 #: A robust kernel's name and where it bends, as ``least_squares.robust_loss`` takes them.
 _Robust = tuple[str | None, float]
 
 
-def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, linear: Callable[[], LinearisedTracks], robust: _Robust) -> bool:
+def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, robust: _Robust, **__: Any) -> bool:
     """Whether the compiled kernels implement the robust kernel and divide the number of tracks."""
     return robust[0] == "geman_mcclure" and _has_whole_lanes(ray)
+
+
+def _minimum_kernel(
+    *tensors: Any, reference: Callable[[], tuple[Unknowns, Tensor]], robust: _Robust, options: tuple[int, bool]
+) -> tuple[Unknowns, Tensor]:
+    *tracks, share, precision = tensors
+    kernel_args = _kernel_arguments(*tracks)
+    best = [torch.empty_like(x) for x in kernel_args[-3:]]
+    cost = share.new_empty(len(share))
+    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
+    (steps, rotation_only), (_, bend) = options, robust
+    torch.ops.dhtorch.minimise_tracks.default(
+        *kernel_args, share, precision, *best, cost, steps, INITIAL_DAMPING, rotation_only, bend, *limits
+    )
+    return Unknowns(Pose(best[0], best[1]), None if tracks[-1] is None else best[2]), cost
+
+
+@operator(
+    kernel=_minimum_kernel,
+    dtypes=_TRACK_DTYPES | {"share": torch.float32, "shutter_precision": torch.float32},
+    any_layout=("R", "t", "shutter_rate"),
+    when=_is_geman_mcclure,
+)
+def _minimum(
+    *tensors: Any, reference: Callable[[], tuple[Unknowns, Tensor]], robust: _Robust, options: tuple[int, bool]
+) -> tuple[Unknowns, Tensor]:
+    """:func:`minimise_tracks` of :func:`_track_tensors`, their weight ``share`` (B, N) and the prior's precision."""
+    return reference()
 
 
 def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:

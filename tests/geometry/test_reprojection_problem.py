@@ -1,5 +1,7 @@
 """Reprojection problem of near and far tracks, against ``support/dense_reprojection.py`` (track by track) and autograd."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -246,3 +248,22 @@ def test_a_step_solves_for_the_pose_and_the_turn(step):
         np.testing.assert_allclose(moved.shutter_rate[b], at.shutter_rate[b].numpy() + xi[6:], rtol=1e-9)
     if step is reprojection_problem.unknowns_step:
         assert torch.equal(moved.shutter_rate[1], at.shutter_rate[1]) and torch.equal(moved.T.R[1], at.T.R[1])
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_a_minimum_without_translation_has_none_and_a_free_one_has_a_lower_cost(turn):
+    problem, at = pose_depth_problem()
+    at = Unknowns(at.T.replace(t=torch.zeros_like(at.T.t)), at.shutter_rate if turn else None)
+    weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
+    options = {"kernel": "geman_mcclure", "bend": 2.0}
+    solve = partial(reprojection_problem.minimise_tracks, problem, at, NOISE, weight, precision, **options)
+    (begin, first), (turned, of_rotation), (free, of_pose) = (
+        solve(steps=0),
+        solve(steps=5, rotation_only=True),
+        solve(steps=5),
+    )
+    assert begin is at and bool((of_rotation < first).all() and (of_pose < of_rotation).all())
+    assert not turned.T.t.any() and free.T.t.any(dim=-1).all() and not torch.equal(turned.T.R, at.T.R)
+    normal, cost = reprojection_problem.pose_normal_equations_at(problem, NOISE, weight, precision, **options)
+    for found, value in ((at, first), (turned, of_rotation), (free, of_pose)):
+        assert torch.equal(cost(found), value) and torch.equal(normal(found).cost, value)

@@ -36,6 +36,7 @@ from dhtorch.geometry import (
 )
 from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
 from dhtorch.geometry.filters import gaussian_blur
+from dhtorch.geometry.map_estimate import estimate_noise_variance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import builder, constants, dispatch, loader
@@ -833,6 +834,27 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
     )
     assert torch.equal(front, ahead) and 0 < front.float().mean() < 1
     torch.testing.assert_close(square, wanted, rtol=1e-3, atol=1e-3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize("rotation_only", [False, True])
+def test_minima_over_tracks_and_their_noise_agree_up_to_rounding(loaded, monkeypatch, turning, rotation_only):
+    problem, at, noise = every_track(turning)
+    used = problem, at, noise, torch.tensor([0.1, 0.7]), torch.tensor([1e4, 10.0])
+    asked = counted(monkeypatch, "minimise_tracks"), counted(monkeypatch, "track_noise")
+    options = {"kernel": "geman_mcclure", "bend": 2.0, "rotation_only": rotation_only}
+    for steps in (0, 1, 4):
+        (found, cost), (expected, wanted) = both_ways(
+            lambda k=steps: reprojection_problem.minimise_tracks(*used, steps=k, **options), monkeypatch
+        )
+        torch.testing.assert_close(cost, wanted, rtol=1e-3, atol=0)
+        assert (found.shutter_rate is None) == (not turning)
+        for a, b in zip(*((x.T.R, x.T.t, x.shutter_rate) for x in (found, expected)), strict=True):
+            assert a is None or (a - b).abs().amax() <= 1e-4
+    found, expected = both_ways(lambda: estimate_noise_variance(problem, at), monkeypatch)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    assert [len(x) for x in asked] == [3, 1]
 
 
 @needs_compiler

@@ -1,12 +1,14 @@
-// Cost and normal equations of near and far tracks, and their squared residuals. Reference:
-// dhtorch/geometry/reprojection_problem.py; the same formulas, 16 or 8 tracks per vector, and sums over tracks in another
+// Cost and normal equations of near and far tracks, their minimum, squared residuals, and noise. References:
+// dhtorch/geometry/reprojection_problem.py and estimate_noise_variance of map_estimate.py; the same formulas and steps, 16 or 8 tracks per vector, and sums over tracks in another
 // order. One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <cmath>
+#include <vector>
 
 namespace {
 
@@ -201,6 +203,188 @@ void squared_residuals(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Ten
   }
 }
 
+// Solution of H x = -g, n equations, by elimination with row pivoting; false where a pivot is zero.
+template <int n>
+bool eliminate(const float* H, const float* g, double* x) {
+  double A[n][n + 1];
+  for (int i = 0; i < n; ++i) {
+    std::copy_n(H + i * n, n, A[i]);
+    A[i][n] = -static_cast<double>(g[i]);
+  }
+  for (int k = 0; k < n; ++k) {
+    int row = k;
+    for (int i = k + 1; i < n; ++i) row = std::fabs(A[i][k]) > std::fabs(A[row][k]) ? i : row;
+    if (A[row][k] == 0) return false;
+    if (row != k) std::swap_ranges(A[k], A[k] + n + 1, A[row]);
+    for (int i = k + 1; i < n; ++i) {
+      const double share = A[i][k] / A[k][k];
+      for (int j = k + 1; j <= n; ++j) A[i][j] -= share * A[k][j];
+    }
+  }
+  for (int i = n - 1; i >= 0; --i) {
+    x[i] = A[i][n];
+    for (int j = i + 1; j < n; ++j) x[i] -= A[i][j] * x[j];
+    x[i] /= A[i][i];
+  }
+  return true;
+}
+
+// The unknowns displaced, by retract_unknowns of reprojection_problem.py.
+template <int n>
+void displace(Tracks& of, const double* step) {
+  float xi[n];
+  for (int i = 0; i < n; ++i) xi[i] = static_cast<float>(step[i]);
+  const float half[3] = {0.5f * xi[0], 0.5f * xi[1], 0.5f * xi[2]};
+  const float by = 2.0f / (1.0f + (half[0] * half[0] + half[1] * half[1] + half[2] * half[2]));
+  const auto cross = [&](const float* b, float* c) {
+    for (int i = 0; i < 3; ++i) c[i] = half[(i + 1) % 3] * b[(i + 2) % 3] - half[(i + 2) % 3] * b[(i + 1) % 3];
+  };
+  for (int c = 0; c < 4; ++c) {
+    float column[3], once[3], twice[3];
+    for (int i = 0; i < 3; ++i) column[i] = c < 3 ? of.R[i][c] : of.t[i];
+    cross(column, once);
+    cross(once, twice);
+    for (int i = 0; i < 3; ++i) {
+      const float x = column[i] + (once[i] + twice[i]) * by;
+      (c < 3 ? of.R[i][c] : of.t[i]) = c < 3 ? x : x + xi[3 + i];
+    }
+  }
+  for (int i = 6; i < n; ++i) of.turn[i - 6] += xi[i];
+}
+
+// How a cost is minimised: the weight of each track and its robust kernel's bend, the precision of the shutter rate's
+// prior, proposals, initial damping, and whether the translation stays.
+struct Search {
+  const float* share;
+  float bend, precision;
+  int64_t steps;
+  float damping;
+  bool rotation_only;
+};
+
+// Cost with the prior, and with H its normal equations.
+template <int n>
+float evaluate(const Tracks& of, const Search& by, float* H, float* g) {
+  float cost = equations<n>(of, by.share, by.bend, H, g), square = 0.0f;
+  for (int i = 6; i < n; ++i) {
+    const float rate = of.turn[i - 6];
+    square += rate * rate;
+    if (H) {
+      H[i * n + i] += by.precision;
+      g[i] += by.precision * rate;
+    }
+  }
+  for (int i = 3; H && by.rotation_only && i < 6; ++i) {
+    for (int j = 0; j < n; ++j) H[i * n + j] = H[j * n + i] = 0.0f;
+    H[i * n + i] = 1.0f;
+    g[i] = 0.0f;
+  }
+  return n > 6 ? cost + by.precision * square : cost;
+}
+
+// minimise of least_squares.py; leaves the best unknowns and returns their cost.
+template <int n>
+float minimise(Tracks& of, const Search& by) {
+  float H[n * n], g[n], next_H[n * n], next_g[n], damped[n * n], factor = by.damping;
+  if (!by.steps) return evaluate<n>(of, by, nullptr, nullptr);
+  float best = evaluate<n>(of, by, H, g);
+  for (int64_t k = 0; k < by.steps; ++k) {
+    const bool last = k == by.steps - 1;
+    double step[n];
+    std::copy_n(H, n * n, damped);
+    for (int i = 0; i < n; ++i) damped[i * n + i] *= 1.0f + factor;
+    Tracks proposal = of;
+    bool accepted = eliminate<n>(damped, g, step);
+    if (accepted) {
+      displace<n>(proposal, step);
+      const float cost = evaluate<n>(proposal, by, last ? nullptr : next_H, next_g);
+      accepted = cost < best;
+      best = accepted ? cost : best;
+    }
+    factor *= accepted ? 0.1f : 10.0f;
+    if (!accepted) continue;
+    of = proposal;
+    std::copy_n(next_H, n * n, H);
+    std::copy_n(next_g, n, g);
+  }
+  return best;
+}
+
+// The same tensors, precision (B): of the shutter rate's prior. Outputs: the best unknowns R (B, 3, 3), t (B, 3) and turn
+// (B, 3), or (0, 3), and their cost (B).
+void minimise_tracks(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest,
+                     Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share,
+                     Tensor precision, Tensor best_R, Tensor best_t, Tensor best_turn, Tensor cost, int64_t steps,
+                     double damping, bool rotation_only, double bend, double nearest_divisor, double behind,
+                     double min_depth) {
+  const int64_t B = ray.size(0), N = ray.size(2);
+  const Limits limits(nearest_divisor, behind, min_depth);
+  for (int64_t k = 0; k < B; ++k) {
+    Tracks of = pair(k, limits, ray, inverse, near, seen, shape, height, nearest, variance, a, b, d, R, t, turn);
+    const Search by{data<float>(share) + N * k, static_cast<float>(bend), data<float>(precision)[k], steps,
+                    static_cast<float>(damping), rotation_only};
+    data<float>(cost)[k] = of.turns ? minimise<9>(of, by) : minimise<6>(of, by);
+    for (int i = 0; i < 3; ++i) {
+      std::copy_n(of.R[i], 3, data<float>(best_R) + 9 * k + 3 * i);
+      data<float>(best_t)[3 * k + i] = of.t[i];
+      if (of.turns) data<float>(best_turn)[3 * k + i] = of.turn[i];
+    }
+  }
+}
+
+// Lower median of values, which are reordered; 1 without one.
+float median(std::vector<float>& values) {
+  if (values.empty()) return 1.0f;
+  const auto middle = values.begin() + (values.size() - 1) / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// The same tensors without the noise's factors; far (B, N) bool. Output: noise (B, N), after `rounds` estimates from the
+// medians of near and far residuals, each divided by that of unit noise, within [low, high].
+void track_noise(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest,
+                 Tensor variance, Tensor far, Tensor R, Tensor t, Tensor turn, Tensor noise, int64_t rounds,
+                 double near_median, double far_median, double low, double high, double nearest_divisor, double behind,
+                 double min_depth) {
+  const int64_t B = ray.size(0), N = ray.size(2);
+  const Limits limits(nearest_divisor, behind, min_depth);
+  std::vector<float> a(N), b(N), d(N), of_near, of_far;
+  for (int64_t k = 0; k < B; ++k) {
+    Tracks of = pair(k, limits, ray, inverse, near, seen, shape, height, nearest, variance, variance, variance, variance, R, t, turn);
+    of.a = a.data();
+    of.b = b.data();
+    of.d = d.data();
+    const bool* distant = data<bool>(far) + N * k;
+    float found[2] = {1.0f, 1.0f};  // variances of near and far tracks
+    for (int64_t round = 0; round < rounds; ++round) {
+      for (int64_t n = 0; n < N; ++n) {
+        const float by = found[distant[n]], xx = of.shape[n] * by, xy = of.shape[N + n] * by, yy = of.shape[2 * N + n] * by;
+        b[n] = xy / xx;
+        a[n] = 1.0f / std::sqrt(xx);
+        d[n] = 1.0f / std::sqrt(yy - b[n] * xy);
+      }
+      of_near.clear();
+      of_far.clear();
+      bool any_far = false;
+      for (int64_t n = 0; n < N; n += LANES) {
+        const Whitened at(of, n);
+        for (int64_t i = 0; i < LANES; ++i) {
+          any_far = any_far || distant[n + i];
+          if (!at.front[i] || std::isnan(at.square[i])) continue;
+          if (of.near[n + i]) of_near.push_back(at.square[i]);
+          if (distant[n + i]) of_far.push_back(at.square[i]);
+        }
+      }
+      const float close = std::sqrt(median(of_near)) / static_cast<float>(near_median);
+      const float factor[2] = {close, any_far ? std::sqrt(median(of_far)) / static_cast<float>(far_median) : close};
+      for (int i = 0; i < 2; ++i) {
+        found[i] = std::clamp(found[i] * factor[i] * factor[i], static_cast<float>(low), static_cast<float>(high));
+      }
+    }
+    for (int64_t n = 0; n < N; ++n) data<float>(noise)[N * k + n] = found[distant[n]];
+  }
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
@@ -213,9 +397,20 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "squared_residuals(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, "
       "Tensor nearest, Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, "
       "Tensor(a!) square, Tensor(b!) front, float nearest_divisor, float behind, float min_depth) -> ()");
+  m.def(
+      "minimise_tracks(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest, "
+      "Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, Tensor precision, "
+      "Tensor(a!) best_R, Tensor(b!) best_t, Tensor(c!) best_turn, Tensor(d!) cost, int steps, float damping, "
+      "bool rotation_only, float bend, float nearest_divisor, float behind, float min_depth) -> ()");
+  m.def(
+      "track_noise(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest, "
+      "Tensor variance, Tensor far, Tensor R, Tensor t, Tensor turn, Tensor(a!) noise, int rounds, float near_median, "
+      "float far_median, float low, float high, float nearest_divisor, float behind, float min_depth) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("pose_normal_equations", TORCH_BOX(&pose_normal_equations));
   m.impl("squared_residuals", TORCH_BOX(&squared_residuals));
+  m.impl("minimise_tracks", TORCH_BOX(&minimise_tracks));
+  m.impl("track_noise", TORCH_BOX(&track_noise));
 }
