@@ -65,6 +65,36 @@ inline Vector within(Vector x, float most) {  // clamp to [0, most]; NaN becomes
   return x < most ? x : Vector{} + most;
 }
 
+#if defined(__FMA__) && defined(DHTORCH_SHUFFLES)
+// Four pixels and their right neighbours, pair by pair: assembled in registers, where compilers write lanes to memory.
+inline __m256d four_pairs(const float* pixels, const int32_t* at) {
+  const auto pair = [&](int k) { return reinterpret_cast<const double*>(pixels + at[k]); };
+  const __m128d low = _mm_loadh_pd(_mm_load_sd(pair(0)), pair(1)), high = _mm_loadh_pd(_mm_load_sd(pair(2)), pair(3));
+  return _mm256_insertf128_pd(_mm256_castpd128_pd256(low), high, 1);
+}
+#endif
+
+// Pixels at indices, and their right neighbours.
+inline void neighbours(const float* pixels, const int32_t* at, Vector& left, Vector& right) {
+#if defined(__AVX512F__) && defined(DHTORCH_SHUFFLES)
+  const auto eight = [&](int k) {
+    return reinterpret_cast<Vector>(_mm512_insertf64x4(_mm512_castpd256_pd512(four_pairs(pixels, at + k)), four_pairs(pixels, at + k + 4), 1));
+  };
+  const Vector a = eight(0), b = eight(8);
+  left = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+  right = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+#elif defined(__FMA__) && defined(DHTORCH_SHUFFLES)
+  const Vector a = reinterpret_cast<Vector>(four_pairs(pixels, at)), b = reinterpret_cast<Vector>(four_pairs(pixels, at + 4));
+  left = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14);
+  right = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
+#else
+  for (int64_t k = 0; k < LANES; ++k) {
+    left[k] = pixels[at[k]];
+    right[k] = pixels[at[k] + 1];
+  }
+#endif
+}
+
 // The window of image 0: six derivative images and T without its mean, and J, each one row padded with zeros to whole
 // vectors.
 struct Window {
@@ -97,7 +127,7 @@ struct Window {
 
   float sum(const float* a, const float* b) const {
     Vector sums = {};
-    for (int64_t i = 0; i < wide; i += LANES) sums += load(a + i) * load(b + i);
+    for (int64_t i = 0; i < wide; i += LANES) sums = fused(load(a + i), load(b + i), sums);
     return total(sums);
   }
 
@@ -122,12 +152,34 @@ struct Window {
     }
   }
 
+  // Rows FIRST to LAST - 1 of the lower half of the pictures' products, and the rows' sums, in one pass.
+  template <int FIRST, int LAST>
+  void products(double (*H)[8]) {
+    constexpr int COUNT = (LAST * (LAST + 1) - FIRST * (FIRST + 1)) / 2;
+    Vector parts[(COUNT + LAST - FIRST + 3) / 4 * 4] = {};
+    for (int64_t i = 0; i < wide; i += LANES) {
+      Vector* to = parts;
+      for (int a = FIRST; a < LAST; ++a) {
+        const Vector own = load(picture(a) + i);
+        for (int b = 0; b <= a; ++b, ++to) *to = fused(own, load(picture(b) + i), *to);
+        *to++ += own;
+      }
+    }
+    float found[sizeof(parts) / sizeof(Vector)];
+    for (size_t k = 0; k < sizeof(found) / sizeof(float); k += 4) totals(parts[k], parts[k + 1], parts[k + 2], parts[k + 3], found + k);
+    const float* from = found;
+    for (int a = FIRST; a < LAST; ++a) {
+      for (int b = 0; b <= a; ++b) H[a][b] = *from++;
+      H[7][a] = *from++;
+    }
+  }
+
   // Lower half of the normal equations of the six derivative images, T and 1.
   void normal(double (*H)[8]) {
-    for (int64_t a = 0; a < 7; ++a) {
-      for (int64_t b = 0; b <= a; ++b) H[a][b] = sum(picture(a), picture(b));
-      H[7][a] = sum(picture(a));
-    }
+    products<0, 3>(H);
+    products<3, 5>(H);
+    products<5, 6>(H);
+    products<6, 7>(H);
     H[7][7] = static_cast<double>(count);
     for (int64_t a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(options.damping);
   }
@@ -145,17 +197,14 @@ struct Window {
       row = row < most ? row : Bits{} + most;
       const Vector right = x - __builtin_convertvector(column, Vector), down = y - __builtin_convertvector(row, Vector);
       const Bits first = row * stride + column;
-      Vector corners[4];
-      for (int64_t k = 0; k < LANES; ++k) {
-        const float* from = patch.pixels + first[k];
-        corners[0][k] = from[0];
-        corners[1][k] = from[1];
-        corners[2][k] = from[stride];
-        corners[3][k] = from[stride + 1];
-      }
-      const Vector above = corners[0] + right * (corners[1] - corners[0]),
-                   below = corners[2] + right * (corners[3] - corners[2]);
-      store((above + down * (below - above)) * load(&inside[i]), &J[i]);
+      int32_t at[LANES];
+      std::memcpy(at, &first, sizeof(at));
+      asm("" : "+m"(at));  // they are read from memory: shifting each out of the vector takes longer
+      Vector left[2], next[2];
+      neighbours(patch.pixels, at, left[0], next[0]);
+      neighbours(patch.pixels + stride, at, left[1], next[1]);
+      const Vector above = fused(right, next[0] - left[0], left[0]), below = fused(right, next[1] - left[1], left[1]);
+      store(fused(down, below - above, above) * load(&inside[i]), &J[i]);
     }
   }
 
@@ -163,10 +212,10 @@ struct Window {
     Vector parts[8] = {};
     for (int64_t i = 0; i < wide; i += LANES) {
       const Vector there = load(&J[i]);
-      for (int64_t k = 0; k < 7; ++k) parts[k] += load(picture(k) + i) * there;
+      for (int64_t k = 0; k < 7; ++k) parts[k] = fused(load(picture(k) + i), there, parts[k]);
       parts[7] += there;
     }
-    for (int64_t k = 0; k < 8; ++k) sums[k] = total(parts[k]);
+    for (int64_t k = 0; k < 8; k += 4) totals(parts[k], parts[k + 1], parts[k + 2], parts[k + 3], sums + k);
   }
 
   // Gain of J over T, and the mean square of the residual.
