@@ -28,6 +28,14 @@ from dhtorch.synthetic import SyntheticRoom
 SIZES, VIEWS, NEAR = ((480, 640), (1440, 1920)), (1, 9), 2.0
 
 
+#: Bytes of memory per pixel and plane: a cost of one byte written and read in two passes, sums of two bytes that are
+#: written by the first and read by the second.
+PER_PLANE = 3 * 1 + 2 * 2
+
+#: Planes of the sweep.
+PLANES = 96
+
+
 def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, Any]]:
     """The sweep beside its peer: in torch, and with compiled code."""
     harness.set_threads(threads)
@@ -55,7 +63,8 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
     a, b, c = harness.in_turn(
         [ours, peer, harness.with_compiled_operators()(ours)], repeats=options.repeats, clock=options.clock
     )
-    more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
+    least = harness.Work(0, PER_PLANE * PLANES * size[0] * size[1])
+    more: dict[str, Any] = {"n": size[0] * size[1], "bar": True, "work": least}
     name, other_side = f"sweep_{hw[1]}x{hw[0]}", "rectify + SGBM"
     return [
         harness.row(name, a, other_side, b, **more),

@@ -1,7 +1,9 @@
 """Timing both sides in turn, in one process, and one row format for every script.
 
 Rows: ``{name, mode, n, batch, threads, processor, git, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error,
-peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faster.
+peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faster. A row whose work is counted also has
+``floor_ms``, the least time that its multiply-adds and bytes take at the rates measured on that machine
+(:func:`measure_rates`).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import torch
@@ -41,6 +43,12 @@ AVX2 = {
     "MKL_ENABLE_INSTRUCTIONS": "AVX2",
     "OPENCV_CPU_DISABLE": "AVX512-SKX",
 }
+
+#: Side of the matrices whose product gives the rate of multiply-adds: three of them are 3 MB.
+RATE_SIDE = 512
+
+#: Length of the vector whose copy gives the rate of memory: 128 MB.
+RATE_FLOATS = 1 << 25
 
 
 def in_turn(
@@ -112,13 +120,41 @@ def _code() -> str | None:
     return result_files.read_git_revision(Path(result_files.__file__).parent)
 
 
+class Work(NamedTuple):
+    """What a row has to do, per its unit of time, however it is done."""
+
+    multiply_adds: float  # in single precision
+    moved_bytes: float  # to and from memory
+
+    def floor_ms(self) -> float:
+        """The least milliseconds: of arithmetic or of memory, whichever is longer."""
+        multiply_adds, moved = measure_rates(torch.get_num_threads())
+        return max(self.multiply_adds / multiply_adds, self.moved_bytes / moved)
+
+
+@cache
+def measure_rates(threads: int) -> tuple[float, float]:
+    """Multiply-adds (float32) and bytes to and from memory, each per millisecond, of this machine with ``threads``.
+
+    The first from a matrix product in cache, the second from a copy of more than the caches hold; the fastest of
+    several, because whatever else runs only slows them down. With ``--avx2`` they are those of AVX2.
+    """
+    a, out = torch.rand(RATE_SIDE, RATE_SIDE), torch.empty(RATE_SIDE, RATE_SIDE)
+    source = torch.rand(RATE_FLOATS)
+    target = torch.empty_like(source)
+    product, copy = in_turn([lambda: torch.mm(a, a, out=out), lambda: target.copy_(source)], repeats=25)
+    return RATE_SIDE**3 / min(product), 2 * source.nbytes / min(copy)
+
+
 def iqr(values: Sequence[float]) -> float:
     """Interquartile range."""
     quarters = statistics.quantiles(values, n=4)
     return quarters[2] - quarters[0]
 
 
-def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **more: Any) -> dict[str, Any]:
+def row(
+    name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], *, work: Work | None = None, **more: Any
+) -> dict[str, Any]:
     """One line of a result file; ``more`` fills n, batch, threads, mode, errors, bar."""
     a, b = statistics.median(ours), statistics.median(theirs)
     base = {
@@ -131,6 +167,7 @@ def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **
         "bar": False,
     }
     timing = {"ours_ms": a, "ours_iqr": iqr(ours), "peer": peer, "peer_ms": b, "ratio": a / b}
+    timing |= {} if work is None else {"floor_ms": work.floor_ms()}
     return {"name": name, **base, "threads": torch.get_num_threads(), **place(), **timing, **more}
 
 
@@ -179,12 +216,13 @@ def arguments(description: str) -> argparse.ArgumentParser:
 def report(rows: list[dict[str, Any]], path: Path | None) -> None:
     """Print the rows as a table and write them as strict JSON."""
     head = f"{'name':34} {'mode':8} {'n':>6} {'B':>3} {'thr':>3} {'ours ms':>9} {'iqr':>7} {'peer':22} {'ms':>9}"
-    print(head + f" {'ratio':>6} {'ours err':>9} {'peer err':>9}")
+    print(head + f" {'ratio':>6} {'ours err':>9} {'peer err':>9} {'floor ms':>9} {'/ floor':>7}")
     for r in rows:
         errors = "".join(f" {r[k]:9.4g}" if r[k] is not None else f" {'-':>9}" for k in ("ours_error", "peer_error"))
+        floor = f" {r['floor_ms']:9.3f} {r['ours_ms'] / r['floor_ms']:7.1f}" if "floor_ms" in r else ""
         print(
             f"{r['name']:34} {r['mode']:8} {r['n'] or 0:6d} {r['batch']:3d} {r['threads']:3d} {r['ours_ms']:9.2f} "
-            f"{r['ours_iqr']:7.2f} {r['peer']:22} {r['peer_ms']:9.2f} {r['ratio']:6.2f}{errors}"
+            f"{r['ours_iqr']:7.2f} {r['peer']:22} {r['peer_ms']:9.2f} {r['ratio']:6.2f}{errors}{floor}"
         )
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -46,6 +46,20 @@ SCENES = {"tum_fr1_desk9": 4, "7s_redkitchen_000": 20, "7s_redkitchen_200": 20, 
 LEVELS = 4
 
 
+#: Multiply-adds of one pixel of a window on one level: three planes read between pixels (3 each), five moments, and 4
+#: steps that read image 1 between pixels (3) and correlate it with two gradients.
+PER_PIXEL = 3 * 3 + 5 + 4 * (3 + 2)
+
+#: Bytes of one pixel of both pyramids: written and read once, grey value and two gradients of image 0, grey value of
+#: image 1, in single precision; the coarser levels add a third.
+PER_PICTURE_PIXEL = 2 * 4 * (3 + 1) * 4 / 3
+
+
+def work(n: int, window: int, hw: tuple[int, int], ways: int = 1) -> harness.Work:
+    """Least work of a pair's search, there (1) or there and back (2)."""
+    return harness.Work(ways * n * LEVELS * window**2 * PER_PIXEL, PER_PICTURE_PIXEL * hw[0] * hw[1])
+
+
 def pairs(count: int) -> tuple[Tensor, Tensor]:
     """Grey images 0 and 1 (count, 1, H, W) uint8, taken from the scenes in turn."""
     root = os.environ.get("DHTORCH_DATA")
@@ -161,7 +175,8 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     )
     common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
     more = {"mode": "torch.compile", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
-    rows = [harness.row(f"lk{suffix}", times[8], "opencv", times[2], **more)]
+    there_work, both_work = (work(n, window, tuple(image_0.shape[-2:]), ways) for ways in (1, 2))
+    rows = [harness.row(f"lk{suffix}", times[8], "opencv", times[2], work=there_work, **more)]
     with harness.with_compiled_operators():
         (missed_compiled, _), _ = accuracy(image_0, uv, window)
     errors = (missed, differ), (missed, differ), (missed_compiled, differ_compiled)
@@ -169,9 +184,9 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         ((0, 3), (1, 4), (6, 7)), ("eager", "cached", "compiled"), errors, strict=True
     ):
         more = {"mode": mode, **common, "ours_error": lost, "peer_error": peer_missed}
-        rows.append(harness.row(f"lk{suffix}", times[there], "opencv", times[2], **more))
+        rows.append(harness.row(f"lk{suffix}", times[there], "opencv", times[2], work=there_work, **more))
         more = {"mode": mode, **common, "ours_error": other}
-        rows.append(harness.row(f"lk_fb{suffix}", times[back], "opencv", times[5], **more))
+        rows.append(harness.row(f"lk_fb{suffix}", times[back], "opencv", times[5], work=both_work, **more))
     return rows
 
 

@@ -26,6 +26,8 @@ from typing import Any
 
 import harness
 import torch
+from lk import PER_PIXEL
+from lk import work as search_work
 
 from dhtorch import data, pytree
 from dhtorch.codes import is_estimated
@@ -52,6 +54,11 @@ GOOD = 0.05
 
 #: Rows and columns of a map from one pixel that is held against the truth to the next.
 EVERY = 4
+
+#: Multiply-adds of ``map`` beyond the search, per point: registration of a window of 21 px (35 products of its normal
+#: equations; five steps that read image 1 at 4 multiply-adds of position and 3 of value and project it on 8 pictures),
+#: and 40 evaluations of the pose's cost at 120.
+MAP_PER_POINT = 21**2 * (35 + 5 * (4 + 3 + 8)) + 40 * 120
 
 PEER = PAPER.replace(
     track=opencv.opencv_lucas_kanade,
@@ -89,6 +96,13 @@ def answers(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> errors
     return errors.points_from_estimate(estimate, truth)
 
 
+def work(name: str, n: int, hw: tuple[int, int]) -> harness.Work:
+    """Least work of one pair: the search there and back, with ``map`` a fifth level, registration and pose."""
+    search = search_work(n, 21, hw, ways=2)
+    more = n * (MAP_PER_POINT + 2 * 21**2 * PER_PIXEL) if name == "map" else 0
+    return search._replace(multiply_adds=search.multiply_adds + more)
+
+
 def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
     """Rows for one batch size and thread count: for each method and mode the whole pair, then each stage."""
     harness.set_threads(threads)
@@ -119,7 +133,8 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
             continue
         name, common = f"pair_{side[0]}_b{batch}", {"n": n, "batch": batch, "mode": side[1]}
         errors_of = {"ours_error": median_rel[side], "peer_error": median_rel[peer]}
-        rows.append(harness.row(name, times[side], "opencv", times[peer], **common, **errors_of, bar=True))
+        least = work(side[0], n, pair[1].hw)
+        rows.append(harness.row(name, times[side], "opencv", times[peer], work=least, **common, **errors_of, bar=True))
         if good[side] and good[peer]:
             a, b = ([t / good[k] for t in times[k]] for k in (side, peer))
             rows.append(harness.row(f"{name}.per_far_answer", a, "opencv", b, **common))

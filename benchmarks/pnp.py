@@ -37,6 +37,13 @@ from dhtorch.stages.pose import pnp_ransac
 
 HW, FOCAL, THRESHOLD_PX, HYPOTHESES = (480, 640), 525.0, 3.0, 64
 K = np.array([[FOCAL, 0, HW[1] / 2], [0, FOCAL, HW[0] / 2], [0, 0, 1]])
+
+#: Multiply-adds of one pose: of a hypothesis 1500 for its minimal problem, and 16 for each of its 4 solutions and each
+#: point that scores it; of a point and step of the refinement 80 (27 sums over two rows of seven, and the projection).
+PER_HYPOTHESIS, PER_COST, PER_STEP = 1500, 4 * 16, 80
+
+#: Points that a hypothesis is scored on, and steps of the refinements, as counts.
+SCORED, STEPS = 64, 10
 PeerPose = tuple[np.ndarray, np.ndarray]
 #: pycolmap is optional, and its import takes a while: only where it is asked.
 HAS_COLMAP = importlib.util.find_spec("pycolmap") is not None
@@ -117,6 +124,11 @@ def arrays(samples: Samples, tracks: Tracks) -> list[tuple[np.ndarray, np.ndarra
     return [(x.double().numpy(), u.double().numpy()) for x, u in zip(samples.xyz, tracks.uv_1, strict=True)]
 
 
+def work(n: int) -> harness.Work:
+    """Least work of a pose from ``n`` points, which are in cache."""
+    return harness.Work(HYPOTHESES * (PER_HYPOTHESIS + PER_COST * min(n, SCORED)) + STEPS * n * PER_STEP, 0)
+
+
 def each(peer: Callable[..., PeerPose], pairs: list[tuple[np.ndarray, np.ndarray]]) -> Pose:
     """A peer's answers to some pairs."""
     R, t = zip(*(peer(*pair) for pair in pairs), strict=True)
@@ -166,7 +178,7 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
             own = "compiled" if mode == "compiled" else "eager"
             more |= {"ours_error": middle[own][0], "peer_error": middle[name][0]}
             more |= {"warm_up_s": seconds} if mode == "torch.compile" else {}
-            rows.append(harness.row(title, times[mode], name, times[name], **more))
+            rows.append(harness.row(title, times[mode], name, times[name], work=work(n), **more))
     return rows
 
 
