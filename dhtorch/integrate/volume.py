@@ -304,7 +304,8 @@ class _ViewIntegrator:
         reach = self.reach[pixel]
         fade = (2 + 2 * along / reach).clamp(0, 1)
         added = self.precision[pixel] * fade
-        weight, distance = volume.weight.view(-1, len(VOLUME_SOURCES)), volume.distance.view(-1)
+        weight = volume.weight.view(-1, len(VOLUME_SOURCES))
+        distance = volume.distance.view(-1)
         old_weight, old = weight[voxel], distance[voxel]
         total = old_weight.sum(-1) + added
         fraction = added / torch.where(total > 0, total, 1.0)
