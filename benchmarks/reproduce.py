@@ -107,6 +107,7 @@ SCRIPTS |= {
     "stream": "--clock cpu --repeats 5",
     "dense_speed": "--clock cpu --repeats 5",
     "start": "--clock cpu --repeats 3",
+    "waterfall": "--clock cpu --repeats 5",
     "degenerate": "",
     "sensitivity": "",
     "capture_faults": "",

@@ -62,6 +62,9 @@ BARS = (
     ("start", "start_import", "eager", 1.2, "`import dhtorch` beside `import torch`"),
 )
 
+#: Smallest share of a call that the table of parts shows, a ratio. Source: chosen, what rounds to one per cent.
+_LEAST_SHARE = 0.005
+
 #: Scripts whose every row is shown.
 SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader", "validate_speed", "start")
 
@@ -163,6 +166,26 @@ def scaling() -> str:
     return on("scaling", text.table_to_markdown(ReportTable("", head, rows)))
 
 
+def waterfall() -> str:
+    """Milliseconds of the parts of whole calls and their shares of the call; parts of less than half a per cent are
+    left out."""
+    shares: dict[str, dict[str, dict[str, Any]]] = {}
+    for r in timings("waterfall"):
+        call, part = r["name"].split(".", 1)
+        shares.setdefault(call, {})[part] = r
+    parts = list(dict.fromkeys(part for by_part in shares.values() for part in by_part))
+    parts.sort(key=lambda part: -sum(by_part[part]["ratio"] for by_part in shares.values() if part in by_part))
+    rows = []
+    for part in parts:
+        cells = [by_part.get(part, {"ratio": 0.0}) for by_part in shares.values()]
+        shown = [f"{r['ours_ms']:,.1f} ({r['ratio']:.0%})" if r["ratio"] >= _LEAST_SHARE else "–" for r in cells]
+        if set(shown) != {"–"}:
+            rows.append([part, *shown])
+    rows.append(["whole call", *(f"{next(iter(by_part.values()))['peer_ms']:,.1f}" for by_part in shares.values())])
+    head = ["ms (share)", *(f"`{call}`" for call in shares)]
+    return on("waterfall", text.table_to_markdown(ReportTable("", head, rows)))
+
+
 def memory() -> str:
     """How far a long stream's memory rises above that of its first frames."""
     rows = [
@@ -200,4 +223,5 @@ def accelerator() -> str:
 
 #: Tables by marker.
 TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling, "memory": memory, "accelerator": accelerator}
+TABLES["waterfall"] = waterfall
 TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}
