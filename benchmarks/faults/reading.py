@@ -86,7 +86,10 @@ TESTS: dict[str, list[str]] = {
     "data.readers.simulator_hdf5": HDF5,
     "data.readers.stray": ["tests/data/test_stray.py"],
     "data.readers.sun3d": FOLDERS,
-    "data.readers.tum": ["tests/data/test_tum.py"],
+    "data.readers.tum": [
+        "tests/data/test_tum.py",
+        "tests/data/test_image_folders.py::test_icl_nuim_takes_the_published_K_and_its_frame_numbers",
+    ],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {

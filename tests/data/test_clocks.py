@@ -11,7 +11,7 @@ import torch
 
 from dhtorch import data
 from dhtorch.data import corrections
-from dhtorch.data.clocks import describe_rate, format_numbers, pair_film
+from dhtorch.data.clocks import describe_rate, format_numbers, interpolate_poses, pair_film
 from dhtorch.synthetic import SyntheticRoom
 
 ROWS = np.arange(12) / 30
@@ -116,3 +116,28 @@ def test_numbers_as_text() -> None:
     assert format_numbers([4, 5, 6], "row") == "rows 4, 5, 6"
     assert format_numbers([1, 3, 4, 5, 6, 9], "row") == "rows 1, 3 to 6, 9"
     assert format_numbers(range(1, 21, 2), "row") == "rows 1, 3, 5, 7, 9, 11 and 4 more"
+
+
+def turned(degrees: Sequence[float]) -> np.ndarray:
+    """Unit quaternions (x, y, z, w) of turns about y."""
+    half = np.radians(np.array(degrees)) / 2
+    return np.stack([0 * half, np.sin(half), 0 * half, np.cos(half)], 1)
+
+
+def test_poses_between_stamps_are_interpolated_and_others_are_the_nearest() -> None:
+    stamps = np.array([0.0, 1.0, 5.0])
+    centres = np.array([[0.0, 0, 0], [2.0, 4, 0], [9.0, 9, 9]])
+    times = np.array([0.25, 1.0, 2.9, 4.9, 5.05, -0.05, 9.0])
+    limits = {"same": 1e-6, "max_difference": 0.2, "max_gap": 1.5}
+    q, t, covered = interpolate_poses(times, stamps, turned([0, 40, 90]), centres, **limits)
+    assert covered.tolist() == [True, True, False, True, True, True, False], "a gap of 4 s is not bridged"
+    expected = turned([10, 40, 90, 90, 0])
+    kept = covered.nonzero()[0]
+    assert np.allclose(q[kept], expected) and np.allclose(
+        t[kept], [[0.5, 1, 0], [2, 4, 0], *[[9, 9, 9]] * 2, [0, 0, 0]]
+    )
+    flipped = turned([0, 40, 90]) * [[1], [-1], [1]]  # the same rotations
+    again, _, _ = interpolate_poses(times[:1], stamps, flipped, centres, **limits)
+    assert np.allclose(np.abs((again * q[:1]).sum(-1)), 1)
+    _, _, alone = interpolate_poses(times, stamps, turned([0, 40, 90]), centres, **{**limits, "max_gap": 0.0})
+    assert alone.tolist() == [False, True, False, True, True, True, False]
