@@ -60,7 +60,7 @@ def clear_non_finite(sample: Mapping[str, Any], keys: Iterable[str], rows: Tenso
 
     ``rows`` (B,): of a batch, the samples to which this applies, each by itself; None = one sample.
     """
-    cleared = {}
+    cleared: dict[str, Any] = {}
     for key in keys:
         value = get_value(sample, key) if has_key(sample, key) else None
         if isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():

@@ -1,5 +1,7 @@
 """Models up to scale: every format is read as it was made, and written in metres with all else unchanged."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -153,6 +155,16 @@ def test_points_that_are_no_places_are_left_out(tmp_path):
     vertex["x"][:2], vertex["z"][3] = np.nan, np.inf
     file.write_bytes(vertices.encode(vertex))
     assert len(read_model(folder).xyz) == len(model.xyz) - 3
+
+
+@pytest.mark.parametrize("kind", ["a folder", "a pipe"])
+def test_points_that_are_no_file_are_named(tmp_path, kind):
+    _, folder = write(tmp_path, "splat")
+    (file,) = folder.rglob("point_cloud.ply")
+    file.unlink()
+    file.mkdir() if kind == "a folder" else os.mkfifo(file)
+    with pytest.raises(FormatError, match=f"point_cloud.ply: file: found {kind}, expected a regular file"):
+        read_model(folder)
 
 
 def test_no_model_names_the_formats(tmp_path):

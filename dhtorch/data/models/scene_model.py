@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import check_regular_file
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera
 from dhtorch.runtime import storage
@@ -146,6 +147,7 @@ def read_points(file: Path) -> PlyVertices:
     Raises:
         FormatError: no such PLY.
     """
+    check_regular_file(file)
     try:
         return read_ply_vertices(file)
     except ValueError as error:
