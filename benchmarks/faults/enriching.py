@@ -53,7 +53,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("LeRobotSource.splits", "int(first) <= k < int(last)", "int(first) <= k <= int(last)"),
         ("LeRobotSource.features", "if k not in missing", "if k"),
         ("LeRobotSource.clips", "length / self.meta.fps", "length"),
-        ("LeRobotSource.batches", "part.slice(0, self.limit - done)", "part"),
+        ("LeRobotSource._scan", "part.slice(0, self.limit - done)", "part"),
         ("LeRobotSource.more", "and p.name not in _REWRITTEN_META_FILES", ""),
         ("_with_frame_index", "done + np.arange(len(stamp))", "np.arange(len(stamp))"),
         ("frame_rate", "recording.times.diff() / recording.number.diff()", "recording.times.diff()"),

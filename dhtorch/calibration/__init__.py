@@ -41,7 +41,7 @@ def load_calibration(name: str | Path) -> Calibration:
         path = Path(__file__).parent / f"{name}.json"
     if not path.is_file():
         raise FileNotFoundError(f"{name}: found no calibration, expected a .json file or one of {list_calibrations()}")
-    return parse_calibration(storage.read_text(path), path.name)
+    return parse_calibration(storage.read_utf8(path), path.name)
 
 
 def load_probability(name: str | Path) -> Callable[[Tensor], Tensor]:

@@ -80,7 +80,7 @@ def parse_strict_json(text: str) -> Any:
     return value
 
 
-def read_text(path: str | Path) -> str:
+def read_utf8(path: str | Path) -> str:
     """Text of a file in UTF-8.
 
     Raises:

@@ -318,7 +318,7 @@ class LearnedScore(nn.Module):
     @classmethod
     def read(cls, path: str | Path) -> Self:
         """The scorer in that file. Raises FileNotFoundError, or ValueError naming the file as :meth:`from_json`."""
-        return cls.from_json(storage.read_text(path), str(path))
+        return cls.from_json(storage.read_utf8(path), str(path))
 
 
 def expected_error_loss(

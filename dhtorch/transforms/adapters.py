@@ -118,7 +118,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
             return self._left_out(dict(blank), f"item {i} cannot be loaded: {error}")
         if self.transform.on_error == "flag":
             like, keys = self._find_layout(i), (*self.transform.read_keys, *self._gap_keys)
-            if difference := layout.describe_difference(sample, like, keys):
+            if difference := layout.explain_difference(sample, like, keys):
                 return self._left_out(layout.conform(sample, like, keys), f"item {i}: {difference}")
         if self.by_batch:
             return self._marked(sample, False)

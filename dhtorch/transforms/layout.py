@@ -34,7 +34,7 @@ def zeros_like(value: Any) -> Any:
     return np.zeros_like(value) if isinstance(value, np.ndarray | np.generic) else value
 
 
-def describe_difference(sample: Mapping[str, Any], like: Mapping[str, Any], keys: Iterable[str]) -> str | None:
+def explain_difference(sample: Mapping[str, Any], like: Mapping[str, Any], keys: Iterable[str]) -> str | None:
     """First of the ``keys`` in ``like`` that a sample lacks, or whose value has another type or shape; None = none."""
     for key in keys:
         if not has_key(like, key):
