@@ -165,6 +165,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("explain_difference", "not has_key(sample, key)", "False"),
         ("_dtype_and_shape", 'getattr(value, "dtype", None)', "None"),
         ("zeros_like", "torch.zeros_like(value)", "torch.ones_like(value)"),
+        ("zeros_like", "return type(value)()", "return value"),
         ("_fill", "if key not in out", "if False"),
     ],
     "transforms.adapters": [
@@ -184,7 +185,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("ExtendedDataset.collate", "collate_kept if skips else collate_shared", "collate_shared"),
         ("one_thread", "opencv.setNumThreads(0)", "opencv.setNumThreads(1)"),
         ("one_thread", "disable_malloc_trim()", "pass"),
-        ("_zeros_like", "return type(value)()", "return value"),
     ],
     "runtime.allocator": [
         ("_TRIM_THRESHOLD", "-1, -3", "-2, -4"),
