@@ -11,7 +11,7 @@ import torch
 
 from dhtorch import data
 from dhtorch.data import corrections
-from dhtorch.data.clocks import describe_rate, format_numbers, interpolate_poses, pair_film
+from dhtorch.data.clocks import describe_rate, format_numbers, interpolate_poses, pair_film, pair_stamps
 from dhtorch.synthetic import SyntheticRoom
 
 ROWS = np.arange(12) / 30
@@ -141,3 +141,10 @@ def test_poses_between_stamps_are_interpolated_and_others_are_the_nearest() -> N
     assert np.allclose(np.abs((again * q[:1]).sum(-1)), 1)
     _, _, alone = interpolate_poses(times, stamps, turned([0, 40, 90]), centres, **{**limits, "max_gap": 0.0})
     assert alone.tolist() == [False, True, False, True, True, True, False]
+
+
+def test_stamps_are_paired_within_half_a_step() -> None:
+    pictures = np.arange(4) * 0.1
+    near, far = (pair_stamps(pictures, pictures + shift).tolist() for shift in (0.03, 0.045))
+    assert near == far == [[k, k] for k in range(4)]
+    assert pair_stamps(pictures, pictures + 0.06).tolist() == [[k + 1, k] for k in range(3)], "the next one is nearer"
