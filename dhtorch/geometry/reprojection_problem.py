@@ -520,10 +520,20 @@ def _minimum_kernel(
     kernel_args = _kernel_arguments(*tracks)
     best = [torch.empty_like(x) for x in kernel_args[-3:]]
     cost = share.new_empty(len(share))
-    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
     (steps, rotation_only), (_, bend) = options, robust
     torch.ops.dhtorch.minimise_tracks.default(
-        *kernel_args, share, precision, *best, cost, steps, INITIAL_DAMPING, rotation_only, bend, *limits
+        *kernel_args,
+        share,
+        precision,
+        *best,
+        cost=cost,
+        steps=steps,
+        damping=INITIAL_DAMPING,
+        rotation_only=rotation_only,
+        bend=bend,
+        nearest_divisor=NEAREST_DEPTH_DIVISOR,
+        behind=BEHIND_CAMERA_RESIDUAL,
+        min_depth=MIN_DEPTH,
     )
     return Unknowns(Pose(best[0], best[1]), None if tracks[-1] is None else best[2]), cost
 
