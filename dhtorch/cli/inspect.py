@@ -26,7 +26,7 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.data import FormatError
 from dhtorch.data import intrinsics as intrinsics_options
-from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file
+from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.recording import Recording
@@ -159,6 +159,8 @@ def _describe_content(path: Path) -> tuple[str, str | None]:
         return f"a {path.suffix or 'plain'} file, which no reader supports", None
     if not any(path.iterdir()):
         return "an empty folder", None
+    if foreign := describe_foreign_folder(path):
+        return foreign.what, foreign.remedy
     inside = [entry for pattern in ("*", "*/*", "*/*/*") for entry in islice(path.glob(pattern), _MAX_NAMES)]
     for file in sorted((entry for entry in inside if entry.is_file()), key=_search_order):
         if foreign := describe_foreign_file(file):

@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol
 
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
-from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file
+from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.readers import (
@@ -257,7 +257,7 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
         for name, reader in FORMATS.items():
             if evidence := reader.recognise(root):
                 return name, evidence
-    foreign = describe_foreign_file(root) if root.is_file() else None
+    foreign = describe_foreign_file(root) if root.is_file() else describe_foreign_folder(root)
     listing = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
     content = ", ".join(listing[:6]) if root.is_dir() else f"a {root.suffix or 'plain'} file"
     if any(name in listing for name in _IMAGE_FOLDERS) and not any("depth" in name.lower() for name in listing):

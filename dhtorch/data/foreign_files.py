@@ -49,6 +49,8 @@ _MODEL_SUFFIXES: Final = (
     *(".usdz", ".usdc", ".usda", ".obj", ".fbx", ".stl", ".glb", ".gltf", ".dae", ".ply", ".las", ".laz", ".e57"),
     *(".splat", ".spz", ".pts", ".xyz"),
 )
+#: Endings of single arrays, which hold the maps of a depth network and no pictures.
+_ARRAY_SUFFIXES: Final = (".npy", ".npz", ".pfm")
 _VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 #: What a capture without depth lacks, in messages.
 NEEDS_DEPTH: Final = "sensor depth of near surfaces is required for metric scale"
@@ -83,6 +85,15 @@ def describe_foreign_file(file: Path) -> ForeignFile | None:
         if file.suffix.lower() in _VIDEO_SUFFIXES
         else None
     )
+
+
+def describe_foreign_folder(folder: Path) -> ForeignFile | None:
+    """What a folder of arrays alone is, and where its maps can be used; None for a folder of other content."""
+    entries = [entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() not in ("", ".md", ".txt")]
+    if not entries or any(entry.suffix.lower() not in _ARRAY_SUFFIXES for entry in entries):
+        return None
+    remedy = f"a capture with images; maps of one are an option: dhtorch validate CAPTURE --depth {folder}"
+    return ForeignFile(f"arrays ({entries[0].name}, …) and no images", export=remedy)
 
 
 def _export_of_video(file: Path) -> str | None:

@@ -45,3 +45,15 @@ def test_videos_and_unknown_files(tmp_path: Path) -> None:
     assert describe_foreign_file(tmp_path / "a.mp4").what.startswith("a video without depth")
     (tmp_path / "a.mkv").write_bytes(b"no video at all")
     assert describe_foreign_file(tmp_path / "a.mkv").what == "a video that cannot be read (content: no EBML header)"
+
+
+def test_a_folder_of_arrays_alone_names_the_option_for_maps(tmp_path: Path) -> None:
+    for name in ("00000.npy", "00001.npy", "README.md"):
+        (tmp_path / name).write_bytes(b"something")
+    said = rf"found arrays \(00000.npy, …\) and no images, .*dhtorch validate CAPTURE --depth {tmp_path}"
+    for find in (data.recognise, inspect.find_captures):
+        with pytest.raises(FormatError, match=said):
+            find(tmp_path)
+    (tmp_path / "00000.png").write_bytes(b"a picture")
+    with pytest.raises(FormatError, match="found 00000.npy, 00000.png"):
+        data.recognise(tmp_path)

@@ -135,7 +135,7 @@ def with_arrays(folder, **changes):
         {"names": np.array([])},
         {"names": np.array(["a"] * 3)},
     ],
-    ids=str,
+    ids=lambda changes: next(iter(changes)),
 )
 def test_arrays_of_other_shapes_and_numbers_are_one_line(tmp_path, changes):
     _, folder = write(tmp_path, "npz")
