@@ -46,9 +46,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("invert", "static_cast<float>(-b / det)", "static_cast<float>(b / det)"),
         ("walk", "p[1] -= step[1];", "p[1] += step[1];"),
         ("walk", "step[1] = found[1] / gain;", "step[1] = found[1];"),
-        ("interpolate", "(1.0f - std::abs(p[1] - static_cast<float>(i)))", "1.0f"),
+        ("interpolate_border", "(1.0f - std::abs(p[1] - static_cast<float>(i)))", "1.0f"),
+        ("interpolate", "left = 1.0f - right", "left = 1.0f"),
+        ("interpolate", "ensure_four(row, column)", "ensure_four(column, row)"),
         ("put", "inverse[1] * a + inverse[2] * b", "inverse[1] * a + inverse[0] * b"),
-        ("project", "subtract(plane(k), inside.data(), mean);", "subtract(plane(0), inside.data(), mean);"),
+        ("project", "here[k] -= mean[k]", "here[k] -= mean[0]"),
     ],
     "ops.csrc.sweep": [
         ("extend", "std::min(from[0], from[2])", "from[0]"),

@@ -71,7 +71,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("LeRobotTarget.assemble", 'sum(each["length"] for each in before)', "0"),
         ("LeRobotTarget._join_rows", "start + done)", "start)"),
         ("LeRobotTarget._recording_rows", "done += len(kept)", "pass"),
-        ("LeRobotTarget._renumber", 'table.append_column(f"source.{name}", table.column(name))', "table"),
+        ("LeRobotTarget._renumber", "table.append_column(kept, table.column(name))", "table"),
         ("LeRobotTarget._summary", "list(tasks) if episode_tasks is None else episode_tasks", "list(tasks)"),
         ("LeRobotTarget._splits", "{indices[-1] + 1}", "{indices[-1]}"),
         ("LeRobotTarget._write_lenses", "if view.lens", ""),

@@ -300,7 +300,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("OutputFolder.adopt", "if not is_private(Path(self._name(path)))", ""),
         ("OutputFolder._open_manifest", 'os.write(self._handle, b"\\n")', "pass"),
         ("OutputFolder._close", "if not self._entries:", "if True:"),
-        ("OutputFolder._remove_unfinished", "[] if folder.is_symlink() else", ""),
+        ("OutputFolder._remove_unfinished", "Path(place) == unfinished or is_unfinished(name)", "True"),
         ("open_output_folder", "opened._remove_unfinished()", "pass"),
         ("open_output_folder", "if is_new:", "if True:"),
         ("open_output_folder", "if (home / name).is_symlink():", "if False:"),

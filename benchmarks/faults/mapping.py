@@ -2,6 +2,7 @@
 
 CODES = ["tests/test_codes_and_records.py"]
 INTEGRATE = ["tests/integrate/test_volume.py", "tests/integrate/test_integrate.py"]
+PIN = ["tests/measure/test_pin.py"]
 PLOTS = ["tests/viz/test_plots.py"]
 POLICY = ["tests/functional/test_policy_inputs.py"]
 SCALE = ["tests/measure/test_scale.py"]
@@ -23,7 +24,17 @@ TESTS: dict[str, list[str]] = {
     "losses.risk_coverage": ["tests/losses/test_risk_coverage.py"],
     "losses.weighted": ["tests/losses/test_weighted.py"],
     "measure.local_scales": SCALE,
-    "measure.models": ["tests/measure/test_models.py"],
+    "data.models.colmap": ["tests/data/test_models.py"],
+    "data.models.network": ["tests/data/test_models.py"],
+    "data.models.scene_model": ["tests/data/test_models.py"],
+    "data.models.splat": ["tests/data/test_models.py"],
+    "geometry.epipolar_motion": ["tests/geometry/test_epipolar_motion.py"],
+    "geometry.motion_fit": ["tests/geometry/test_motion_fit.py", *PIN],
+    "measure.pin": PIN,
+    "measure.scale": SCALE,
+    "metrics.camera_paths": ["tests/metrics/test_grouped.py"],
+    "metrics.change_points": PIN,
+    "metrics.grouped": ["tests/metrics/test_grouped.py"],
     "viz.plots.axis": PLOTS,
     "viz.plots.maps": PLOTS,
     "viz.plots.previews": PLOTS,
@@ -113,10 +124,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "integrate.surface": [
         ("extract_points", "front / (front - back)", "0.5 * front / front"),
         ("_interpolate_chunk", "torch.stack((1 - t, t))", "torch.stack((t, 1 - t))"),
-        ("_distance_gradient", "(ahead - behind) / 2", "(ahead - behind)"),
-        ("_voxel_slots", "(x * BLOCK_SIDE + y) * BLOCK_SIDE + z", "(z * BLOCK_SIDE + y) * BLOCK_SIDE + x"),
+        ("_VoxelTable.gradient", "(ahead - behind) / 2", "(ahead - behind)"),
+        ("_VoxelTable.number", "+ y << _SIDE_BITS) + z", "+ z << _SIDE_BITS) + y"),
     ],
-    "integrate.sweeps": [("depth_step_rel", "far * near - 1", "far - near")],
+    "integrate.sweeps": [("depth_step_rel", "1 / torch.where(", "torch.where(")],
     "integrate.volume": [
         ("make_volume", "4 * voxel", "2 * voxel"),
         ("drop_unconfirmed", "volume.n_swept >= least", "volume.n_swept > least"),
@@ -126,21 +137,68 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("local_scales", "row * REGIONS[1] + column", "row * REGIONS[0] + column"),
         ("local_scales", "np.log(depth / model_depth)", "np.log(model_depth / depth)"),
         ("estimate_scale", "local.sigma[here] ** -2", "local.sigma[here] ** -1"),
-        ("estimate_scale", "(n - 1) / n * (", "1 / n * ("),
-        ("_robust_mean", "np.abs(x - mean) / 1.5", "0 * x"),
         ("find_faults", "np.argsort(-excess)", "np.argsort(excess)"),
-        ("_fit_contrasts", "X - w @ X", "X"),
         ("_gradients", "4 * x**2", "4 * x"),
     ],
-    "measure.models": [
+    "geometry.epipolar_motion": [
+        ("fit_epipolar_motion", "torch.where(ahead[:, None] < 0, -s, s)", "s"),
+        ("fit_epipolar_motion", "robust / sine**2", "robust / sine"),
+        ("fit_epipolar_motion", "used & (distance.abs()", "~used & (distance.abs()"),
+    ],
+    "geometry.motion_fit": [
+        ("fit_motion", ".argmin())", ".argmax())"),
+        ("fit_motion", "usable & (square <", "usable | (square <"),
+        ("_step", "-g[..., None]", "g[..., None]"),
+        ("_free", "if rotation_only", "if not rotation_only"),
+        ("rotation_from_flow", "-y, 0.0", "y, 0.0"),
+        ("scene_flow", "0.5 * ((J @ cov", "((J @ cov"),
+    ],
+    "measure.pin": [
+        ("CameraPin._live_camera", "self.frame.hw, hw)", "hw, self.frame.hw)"),
+        ("CameraPin._leave_out", "torch.where(mask[..., None]", "torch.where(~mask[..., None]"),
+        ("CameraPin.check", "picture[b : b + 1]", "picture[:1]"),
+        ("CameraPin._conclude", "(distance > limit) | translates", "distance > limit"),
+        ("CameraPin._conclude", "T_ref = se3.invert(T)", "T_ref = T"),
+        ("CameraPin._conclude", "answered = reason == PinReason.ANSWERED", "answered = reason >= PinReason.ANSWERED"),
+        ("_select_tracks", "first.valid | second.valid", "first.valid"),
+    ],
+    "measure.scale": [
+        ("_measure", "uv + 0.5", "uv"),
+        ("_model_depths", "(view.depth.shape[0], view.depth.shape[1])", "(view.depth.shape[1], view.depth.shape[0])"),
+        ("_same_pixels", "view.hw, frame.hw)[None]", "frame.hw, view.hw)[None]"),
+        ("_is_clean", "samples.flag[0] & _UNCLEAN == 0", "True"),
+        ("_match_views", "sorted(matches, key=lambda m: m.frame)", "matches[:1]"),
+    ],
+    "metrics.camera_paths": [
+        ("align_camera_paths", "np.linalg.det(u @ vt)", "-np.linalg.det(u @ vt)"),
+        ("align_camera_paths", "own[:, :3, 3] - turned", "own[:, :3, 3]"),
+        ("scale_of_camera_paths", "a[ok] / b[ok]", "b[ok] / a[ok]"),
+    ],
+    "metrics.change_points": [
+        ("median_of_three", ".median(-1)", ".max(-1)"),
+        ("mean_changes", "gain > limit", "gain < limit"),
+        ("mean_changes", "low + place, high)]", "low + place, high - 1)]"),
+        ("_best_split", "k * (n - k) / n", "n"),
+    ],
+    "metrics.grouped": [
+        ("mean_over_stretches", "(n - 1) / n * (", "1 / n * ("),
+        ("huber_mean", "np.abs(x - mean) / _HUBER_BEND", "0 * x"),
+        ("grouped_slopes", "X - w @ X", "X"),
+    ],
+    "data.models.scene_model": [
         ("Similarity.apply", "self.scale * xyz @ self.R.T", "self.scale * xyz @ self.R"),
         ("Similarity.apply", "+ self.t", "+ self.scale * self.t"),
         ("Similarity.move", "self.R @ moved[..., :3, :3]", "moved[..., :3, :3]"),
-        ("_move_w2c", "similarity.move(np.linalg.inv(w2c))", "similarity.move(w2c)"),
-        ("_move_w2c", "[1, 2, 3, 0]", "[0, 1, 2, 3]"),
-        ("_write_points", "np.log(similarity.scale)", "similarity.scale"),
-        ("_read_splat", "w / 2 - 0.5, h / 2 - 0.5", "w / 2, h / 2"),
+        ("write_points", "np.log(similarity.scale)", "similarity.scale"),
+    ],
+    "data.models.colmap": [
+        ("_move_pose", "similarity.move(image.c2w)", "image.c2w"),
+        ("_move_pose", "[3, 0, 1, 2]", "[0, 1, 2, 3]"),
+    ],
+    "data.models.splat": [("read_splat_model", "w / 2 - 0.5, h / 2 - 0.5", "w / 2, h / 2")],
+    "data.models.network": [
         ("_write_arrays", "value * value.dtype.type(similarity.scale)", "value"),
+        ("_views_of_arrays", "maps.shape[-1] != trailing", "False"),
     ],
     "viz.plots.axis": [
         ("Axis.place", "(at - low) / (high - low)", "(at - low) / high"),

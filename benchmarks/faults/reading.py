@@ -57,6 +57,7 @@ TESTS: dict[str, list[str]] = {
     "data.readers.azure_kinect": ["tests/data/test_azure_kinect.py"],
     "data.readers.bop": FOLDERS,
     "data.readers.ca1m": ["tests/data/test_ca1m.py"],
+    "data.codecs.colmap": POSED,
     "data.readers.colmap": POSED,
     "data.readers.driving": READERS,
     "data.readers.frames_dir": READERS,
@@ -226,9 +227,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_decode_confidence", "2 / largest", "1 / largest"),
         ("_UNITS_PER_METRE", "1000.0", "100.0"),
     ],
-    "data.readers.colmap": [
-        ("make_colmap_lens", "cx - 0.5, cy - 0.5", "cx, cy"),
-        ("make_colmap_lens", "focal[0], focal[-1]", "focal[-1], focal[0]"),
+    "data.codecs.colmap": [
+        ("_make_lens", "cx - 0.5, cy - 0.5", "cx, cy"),
+        ("_make_lens", "focal[0], focal[-1]", "focal[-1], focal[0]"),
     ],
     "data.readers.driving": [
         (

@@ -55,5 +55,5 @@ def test_a_folder_of_arrays_alone_names_the_option_for_maps(tmp_path: Path) -> N
         with pytest.raises(FormatError, match=said):
             find(tmp_path)
     (tmp_path / "00000.png").write_bytes(b"a picture")
-    with pytest.raises(FormatError, match="found 00000.npy, 00000.png"):
+    with pytest.raises(FormatError, match=r"found 00000\.npy, 00000\.png"):
         data.recognise(tmp_path)
