@@ -45,7 +45,7 @@ FINAL_BEND = 3.0
 AGREEING_SIGMAS = 3.0
 
 #: Share of the model's covariance that is added to the sandwich, which few groups understate.
-#: Source: calibrated on moved cameras in built-in rooms of seeds 40 and 41: .70 of the errors within one sigma.
+#: Source: chosen on moved cameras in built-in rooms of seeds 40 and 41: .70 of the errors within one sigma.
 MODEL_SHARE = 0.65
 
 #: Median length of a residual of two Gaussian coordinates with unit sigma. Source: derived, sqrt(2 log 2).

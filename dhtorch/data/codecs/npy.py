@@ -108,6 +108,20 @@ def list_npz_members(file: Path) -> list[str]:
             return archive.namelist()
 
 
+def list_npz(file: Path) -> set[str]:
+    """Names of the arrays of an ``.npz`` archive, after checking the memory that all of them take together.
+
+    Raises:
+        FormatError: missing or damaged archive, or larger than the memory limit allows.
+    """
+    with open_regular(file) as stream:
+        check_zip_directory(stream, file)
+        with _open_archive(stream, file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            check_memory(file, "arrays", size, f"{size} bytes unpacked", file.stat().st_size)
+            return {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
+
+
 @contextmanager
 def _open_archive(stream: BinaryIO, file: Path) -> Iterator[zipfile.ZipFile]:
     """The archive of a stream, with its errors as FormatError."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.codecs.npy import list_npz_members, read_npz
+from dhtorch.data.codecs.npy import list_npz, read_npz
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.models.scene_model import IMAGE_SUFFIXES, ModelView, SceneModel, Similarity, find_picture
@@ -37,7 +37,7 @@ def read_network_model(root: Path, archives: Sequence[Path], pictures: Path | No
     """
     views: list[ModelView] = []
     for archive in archives:
-        present = {name.removesuffix(".npy") for name in list_npz_members(archive) if name.endswith(".npy")}
+        present = list_npz(archive)
         key = {kind: next((n for n in names if n in present), None) for kind, names in _ARRAY_NAMES.items()}
         missing = [kind for kind in ("K",) if key[kind] is None]
         missing += ["w2c or c2w"] if key["w2c"] is key["c2w"] is None else []

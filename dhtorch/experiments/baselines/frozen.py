@@ -93,6 +93,7 @@ MAP_1 = Method(
         near_steps=4,
         steps=6,
         threshold_px=3.0,
+        blocks=None,
     ),
     verify=None,
     triangulate=partial(
