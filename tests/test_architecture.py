@@ -1,6 +1,7 @@
 """The floor plan: imports go down only, cv2 and hydra live where they should, and importing costs little."""
 
 import ast
+import functools
 import importlib
 import re
 import subprocess
@@ -37,16 +38,19 @@ LAZY = ("__init__.py", "__main__.py", "cli/")
 FILES = sorted(ROOT.rglob("*.py"))
 
 
+@functools.cache
 def imports(path):
     """Of each import of a file its dotted name, `from a import b` as a.b, and whether it stands within a function."""
     tree = ast.parse(path.read_text())
+    found = []
     within = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, id(node) in within) for alias in node.names)
+            found += ((alias.name, id(node) in within) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from ((f"{node.module}.{alias.name}", id(node) in within) for alias in node.names)
+            found += ((f"{node.module}.{alias.name}", id(node) in within) for alias in node.names)
+    return found
 
 
 def module_of(name):

@@ -63,6 +63,7 @@ def test_tails_of_returns_are_found(drawn, expected):
     assert estimate_freedom(r, points).tolist() == [expected, expected]
 
 
+@pytest.mark.slow
 def test_returns_with_normal_noise_are_worth_what_least_squares_makes_of_them():
     off = {"ours": [], "least squares": []}
     for seed in range(12):

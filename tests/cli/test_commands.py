@@ -181,6 +181,7 @@ def test_the_printed_next_command_runs(command, tmp_path):
     assert code == 0 and re.search(r"coverage|answered", out), err
 
 
+@pytest.mark.slow
 def test_the_next_command_has_the_reader_options_of_this_one(command, tmp_path):
     room = SyntheticRoom(n_frames=3, hw=(120, 160), depth_hw=(120, 160), step_m=0.05)
     writers.write_counted_frames(tmp_path / "above" / "capture", [room[k] for k in range(3)])

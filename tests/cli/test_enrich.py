@@ -180,7 +180,9 @@ def test_it_reads_back_as_a_recording(enriched, shots):
     assert (frame.depth - shots[0].depth)[near].abs().median() <= STEP
 
 
-@pytest.mark.parametrize("place", ["shard", "table", "meta"])
+@pytest.mark.parametrize(
+    "place", ["table", *(pytest.param(each, marks=pytest.mark.slow) for each in ("shard", "meta"))]
+)
 def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
     place, robot, enriched, tmp_path, monkeypatch, capsys
 ):

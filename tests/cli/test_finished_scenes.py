@@ -88,6 +88,7 @@ def interrupt(command, computed, folder, *options, after):
     return kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "loops"),
     [((), 1), pytest.param(("experiment=calibration",), 2, marks=pytest.mark.slow)],

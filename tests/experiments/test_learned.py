@@ -252,6 +252,7 @@ def test_the_control_is_worth_its_scale_alone(room, installed):
     assert row["parameters"] == 0 and row["median_rel"] > 0.1 and outcome.verdict == "undecided"
 
 
+@pytest.mark.slow
 def test_without_vggt_nothing_is_decided(room, installed):
     outcome = asked(
         room, installed, models={"dust3r": partial(dust3r.DUSt3R, weights=installed["dust3r"])}, scales=("oracle",)

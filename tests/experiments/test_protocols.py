@@ -165,7 +165,13 @@ def test_a_candidate_with_a_return_of_the_sensor_raises_with_the_scene():
         range_split.require_no_returns(rows(3).rows, "full")
 
 
-@pytest.mark.parametrize("experiment", [range_split, heldout, real_holes, gate_ablation, device_pose, calibration])
+@pytest.mark.parametrize(
+    "experiment",
+    [
+        *(range_split, real_holes, device_pose),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (heldout, gate_ablation, calibration)),
+    ],
+)
 def test_the_protocols_take_the_truth_test_and_state_what_it_keeps(experiment):
     """Without a test every return is kept: more candidates, and a share of one."""
     options = {range_split: {"cutoff_factors": ()}, gate_ablation: {"factors": ()}}.get(experiment, {})

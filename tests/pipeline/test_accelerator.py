@@ -61,10 +61,10 @@ def assert_alike(there, here):
 # ---------------------------------------------------------------------------------------------------- everywhere
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("fused", "complete")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("paper", "auto", "fused", "complete")]
 
 
-@pytest.mark.parametrize("name", ["paper", "map", "auto", *SLOW])
+@pytest.mark.parametrize("name", ["map", *SLOW])
 def test_no_stage_makes_the_host_wait(name):
     """From the second call on, when constants lie on the device, and with nothing that mixes devices."""
     torch.manual_seed(0)

@@ -32,7 +32,7 @@ from dhtorch import data
 from dhtorch.data import FormatError
 
 SAMPLES = CAPTURES | OTHER_INPUTS
-MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
+MUTANTS, MANY = 10, 2000  # of every format; the many run with the slow tests
 
 
 @pytest.mark.parametrize("name", SAMPLES)

@@ -144,7 +144,10 @@ def run_into(words: Words, out: Path) -> int:
     return run.main([word.replace("OUT", str(out)) for word in words])
 
 
-@pytest.mark.parametrize("command", WRITERS)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(name, marks=[] if name in ("enrich", "complete") else pytest.mark.slow) for name in WRITERS],
+)
 def test_an_empty_or_shortened_output_counts_as_missing(
     command: str, robot: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,6 +54,7 @@ def test_what_is_freed_is_not_asked_for_again():
     assert max(said("worker")[1]) < given_back[2] / 5
 
 
+@pytest.mark.slow
 @glibc
 @pytest.mark.parametrize("name", ["MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"])
 def test_what_the_environment_says_stands(name):

@@ -223,6 +223,7 @@ def test_small_pictures_choose_views_as_large_ones_do(room):
         select_views_by_preview(reference, candidates, 9)
 
 
+@pytest.mark.slow
 def test_each_reference_of_a_batch_gets_its_own_views(room):
     references = [room[0], room[11]]
     others = [[room[k] for k in ks] for ks in ((1, 3, 6, 9), (10, 8, 5, 2))]

@@ -361,6 +361,7 @@ def test_a_smeared_picture_is_the_mean_of_the_sharp_one_along_its_line():
     assert error(right, down) < 0.8 * min(others)
 
 
+@pytest.mark.slow
 def test_frames_are_the_same_in_any_order():
     for name in ("held_object", "exposure_jump", "motion_blur"):
         one, two = (room(name, hw=(48, 64), n_frames=n) for n in (7, 9))
