@@ -119,6 +119,7 @@ def agrees_when_compiled(fn, args, backend, atol=1e-12):
             torch.testing.assert_close(g, h, rtol=1e-9, atol=atol * float(1 + g.abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHEAP)
 def test_a_compiled_stage_and_its_gradients_are_the_plain_ones(stages, name):
     agrees_when_compiled(*stages[name], "aot_eager")

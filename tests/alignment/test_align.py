@@ -253,6 +253,7 @@ def test_exact_returns_outweigh_edges_that_an_affine_map_would_hide():
     assert error(align_depth(truth, [near, few]), truth) < 0.005
 
 
+@pytest.mark.slow
 def test_maps_of_a_batch_may_have_anchors_of_their_own_number():
     truth, near, far = world(batch=2)
     fewer = torch.tensor([[1], [0]], dtype=torch.bool) | (torch.arange(near.depth.shape[1]) % 4 == 0)

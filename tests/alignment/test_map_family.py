@@ -78,6 +78,7 @@ def room():
     return truth, Samples(uv, z, 0.01 * z, torch.stack((z, z, z), -1), zero + 1, code, zero, code)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["metric", "scale", "affine"])
 @pytest.mark.parametrize(("change", "name"), [(z_buffer(0.01, 50.0), "z-buffer"), (lambda z: 1 / z, "disparity")])
 def test_a_map_that_is_no_depth_gets_no_answer_and_its_family_is_named(room, kind, change, name):

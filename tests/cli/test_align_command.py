@@ -57,6 +57,7 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     assert run.main([*asked, "kind=affine"]) == run.EXIT_FAILED, "other maps in the same folder"
 
 
+@pytest.mark.slow
 def test_a_z_buffer_is_named_and_gets_no_answer(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1 - 0.01 / room.truth(k)["depth"][0].numpy())
@@ -72,6 +73,7 @@ def test_a_z_buffer_is_named_and_gets_no_answer(tmp_path, room, capsys):
     assert report["maps"]["depth_unit"] == "depth unit assumed: 1 m"
 
 
+@pytest.mark.slow
 def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())

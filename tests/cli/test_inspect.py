@@ -236,6 +236,7 @@ def test_poses_that_jump_or_contradict_the_depth() -> None:
     assert not any("contradict" in w for w in warned(frames))
 
 
+@pytest.mark.slow
 def test_times_that_stand_or_gap() -> None:
     frames = walk(6)
     gap = torch.tensor([0, 1, 2, 9, 10, 11], dtype=torch.float64) / 30

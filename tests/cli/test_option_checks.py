@@ -75,6 +75,7 @@ def test_the_folder_of_what_is_made_is_out_or_output_to_every_command(command, t
     assert "nowhere" in command("validate", "nowhere", "out=o")[2]
 
 
+@pytest.mark.slow
 def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(view, "run", lambda settings, *_, **__: asked.append(settings))

@@ -115,6 +115,7 @@ def test_verbose_says_what_is_read_and_done(command):
     assert command(*TINY)[2] == "", "the next call is as before"
 
 
+@pytest.mark.slow
 def test_the_loudness_of_a_job_is_none_of_its_settings(command, tmp_path):
     command("-v", *TINY, "output=job", "resume=true")
     before = (tmp_path / "job/result.json").read_bytes()

@@ -40,6 +40,7 @@ def test_a_model_is_written_in_metres(capture, model, capsys):
     assert (out / "scale.html").read_text().count("data:image/png;base64,") == 3
 
 
+@pytest.mark.slow
 def test_the_model_is_moved_into_the_world_of_the_capture(capture, model, tmp_path):
     words = ["--cutoff", "2.5", "--frame", "capture", "--out", str(tmp_path / "out")]
     assert run.main(["scale", str(model[0]), str(capture), *words]) == 0

@@ -108,6 +108,7 @@ def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
     assert said in lines[0]
 
 
+@pytest.mark.slow
 def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
     for file in maps.glob("*.npy"):
         np.save(file, 1.1 * np.load(file))

@@ -18,6 +18,8 @@ from dhtorch.pipeline.presets import PAPER, PAPER_DIRECT
 from dhtorch.records import TrackHint
 from dhtorch.stages.track_chain import track_chain
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 
 def listening(seen):
     """A method whose tracker notes (image 0, image 1, the images between) of every call."""

@@ -5,6 +5,8 @@ import pytest
 from dhtorch.experiments.compare import field_study
 from dhtorch.experiments.compare.field_study import holds
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 OUTPUT = "50 %: 1.862 m, poses 5; Warning: the poses look like OpenGL axes; 12,345 pixels"
 
 

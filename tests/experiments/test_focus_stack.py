@@ -22,6 +22,8 @@ from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
 from dhtorch.synthetic.viewpoints import open_viewpoints
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 ROOT = os.environ.get("DHTORCH_DATA")
 
 

@@ -9,6 +9,8 @@ from dhtorch.experiments.paper import global_map as experiment
 from dhtorch.experiments.protocol import Settings
 from dhtorch.synthetic.recording import SyntheticRoom
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 
 def room(**options):
     return SyntheticRoom(**{"hw": (240, 320), "n_frames": 4, "step_m": 0.04, "supersample": 1, **options})

@@ -13,6 +13,8 @@ from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 
 def surface(n, seed=0, noise=0.0):
     """Points (1, n, 3) of a bumpy surface in front of a camera, drawn at random."""

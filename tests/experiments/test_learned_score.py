@@ -16,6 +16,8 @@ from dhtorch.metrics.errors import points_from_estimate
 from dhtorch.stages.score import SCORE_FEATURES, LearnedScore
 from dhtorch.synthetic.recording import SyntheticRoom
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 with initialize_config_dir(str(config_dir()), version_base="1.3"):
     MAP = instantiate(compose("run", ["method=map", "method.n=512"]).method, _convert_="all")
 

@@ -38,6 +38,8 @@ from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.testing.lerobot import write_lerobot
 from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 ROOT = os.environ.get("DHTORCH_DATA")
 
 
@@ -320,6 +322,7 @@ def test_too_few_tasks_are_refused_before_any_feature_is_computed(robot_set):
         rh20t_probe.run(robot_set[:2], {"none": None}, None, Settings(), dinov2=None, horizon=0.2, history=0.2)
 
 
+@pytest.mark.slow
 def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set):
     pytest.importorskip("transformers")
     outcome = rh20t_probe.run(

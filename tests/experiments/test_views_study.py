@@ -11,6 +11,8 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.compare import views_study
 from dhtorch.experiments.protocol import Outcome, Protocol, Settings, Variant
 
+pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
+
 
 def study(scenes, *, step=1, **options):
     methods = {"map": MAP, "auto": choosing(step)}

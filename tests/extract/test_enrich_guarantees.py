@@ -275,6 +275,7 @@ def test_an_older_version_of_the_format(robot, whole, tmp_path):
         assert a[f"{FRONT}_depth_enriched"] == b[f"{FRONT}_depth_enriched"]
 
 
+@pytest.mark.slow
 def test_the_whole_is_never_held(tmp_path, monkeypatch):
     content = os.urandom(300_000)
     made = MapRowDataset.features

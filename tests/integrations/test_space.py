@@ -39,6 +39,7 @@ def test_an_upload_gives_a_picture_and_a_page(app, tmp_path):
     assert "4 frames" in text
 
 
+@pytest.mark.slow
 def test_bad_uploads_are_one_line(app, tmp_path):
     with zipfile.ZipFile(tmp_path / "bad.zip", "w") as archive:
         archive.writestr("../outside.txt", "x")

@@ -1169,6 +1169,7 @@ def test_workers_that_start_while_the_library_is_replaced_have_a_whole_one(cache
     assert [row for rows in found.values() for row in rows] == [[f"compiled {loader.level()}", [], True]] * 24
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.skipif(sys.platform != "linux", reason="the compiler of this test is a shell script")
 def test_builds_of_several_processes_at_once_leave_one_whole_library(cache, tmp_path, monkeypatch):

@@ -204,6 +204,7 @@ def test_without_the_stage_the_map_is_the_sweep_alone(views):
     assert torch.equal(trace["fused"].depth.nan_to_num(), trace["sparse"].depth.nan_to_num())
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop_bit_for_bit(room, views):
     reference = range_split(room[4], NEAR)
     others = stack([range_split(room[k], NEAR) for k in (1, 7, 10, 11)])

@@ -37,6 +37,7 @@ def same(a, b) -> bool:
     return all(torch.equal(getattr(a, k).nan_to_num(), getattr(b, k).nan_to_num()) for k in ("depth", "sigma", "gate"))
 
 
+@pytest.mark.slow
 def test_the_newest_frame_is_answered_from_those_before_it(frames: list[Frame]) -> None:
     stream = Stream(FAST, steps=(1, 2, 4))
     first = stream.push(frames[0])

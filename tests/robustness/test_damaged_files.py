@@ -32,10 +32,12 @@ from dhtorch import data
 from dhtorch.data import FormatError
 
 SAMPLES = CAPTURES | OTHER_INPUTS
-MUTANTS, MANY = 10, 2000  # of every format; the many run with the slow tests
+MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
+#: Captures by name; the other inputs, which ``make fuzz`` reads too, run with the slow tests.
+NAMES = [*CAPTURES, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHER_INPUTS)]
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.parametrize("name", NAMES)
 def test_damaged_captures_are_a_format_error_or_valid(name: str, tmp_path: Path) -> None:
     counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MUTANTS)
     assert counts["frames"] > 0 and counts["FormatError"] > MUTANTS // 5  # damage is felt, and not everywhere
@@ -51,7 +53,7 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("examples", [3, pytest.param(80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
-@pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.parametrize("name", NAMES)
 def test_damage_that_hypothesis_looks_for(name: str, examples: int, tmp_path: Path) -> None:
     """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
     write, read = SAMPLES[name]

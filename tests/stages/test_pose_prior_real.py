@@ -56,6 +56,7 @@ def error(estimate, whole: Frame, near: float) -> float:
     return float(((estimate.depth - true).abs() / true)[far].median())
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["holo_a", *(pytest.param(s, marks=pytest.mark.slow) for s in SETS if s != "holo_a")])
 def test_true_poses_are_used_and_wrong_ones_named(name: str) -> None:

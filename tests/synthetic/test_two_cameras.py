@@ -89,6 +89,7 @@ def test_features_of_two_cameras_are_refused_and_name_the_option(robot, tmp_path
     assert main([*words, f"data.camera={LEFT}"]) == 0
 
 
+@pytest.mark.slow
 def test_other_cameras_of_the_instant_are_the_views_of_pairs_cameras(robot, tmp_path):
     words = ["data=rig", f"data.root={robot}", "pairs=cameras", "holdout=none", "figures=false", *ASKED]
     assert main([*words, f"output={tmp_path / 'rig'}"]) == 0

@@ -381,6 +381,7 @@ class Nested(Frames):
         return {**super().__getitem__(i), "episode": {"number": torch.tensor(i)}}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 @pytest.mark.parametrize("by_batch", [False, True])
 @pytest.mark.parametrize("context", ["fork", "spawn"])
