@@ -86,7 +86,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "cli.inspect": [
         ("_extent", "half_width * hw[0] / hw[1]", "half_width * hw[1] / hw[0]"),
-        ("_pick_evenly", "(n - 1) / max(count - 1, 1)", "n // max(count, 1)"),
         ("_nearest_per_block", "-depth, -torch.inf", "depth, -torch.inf"),
         ("_depth_limits", "low + 1e-3", "low"),
     ],

@@ -35,6 +35,7 @@ TESTS: dict[str, list[str]] = {
     "metrics.camera_paths": ["tests/metrics/test_grouped.py"],
     "metrics.change_points": PIN,
     "metrics.grouped": ["tests/metrics/test_grouped.py"],
+    "pipeline.picture_matching": ["tests/cli/test_numbers.py", *SCALE],
     "viz.plots.axis": PLOTS,
     "viz.plots.maps": PLOTS,
     "viz.plots.previews": PLOTS,
@@ -199,6 +200,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "data.models.network": [
         ("_write_arrays", "value * value.dtype.type(similarity.scale)", "value"),
         ("_views_of_arrays", "maps.shape[-1] != trailing", "False"),
+    ],
+    "pipeline.picture_matching": [
+        ("spread_evenly", "len(items) - 1, min(", "len(items) - 2, min("),
+        ("match_pictures", "alike[i] > _MIN_CORRELATION", "alike[i] < _MIN_CORRELATION"),
+        ("is_same_picture", "moved.median() < _SAME_PICTURE_PX", "moved.median() > _SAME_PICTURE_PX"),
     ],
     "viz.plots.axis": [
         ("Axis.place", "(at - low) / (high - low)", "(at - low) / high"),

@@ -34,6 +34,7 @@ from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.geometry.sensor_noise import sensor_of_format
+from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
@@ -321,7 +322,7 @@ def _read_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]
     shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
     for kind, sources in (("image", pictures), ("depth", depths)):
-        for file in _pick_evenly(sources, frames):
+        for file in spread_evenly(sources, frames):
             try:
                 picture = files.read_image(file) if kind == "image" else files.read_depth_png(file, 1000.0)
                 shown[kind][file.name] = torch.from_numpy(picture)
@@ -335,11 +336,6 @@ def _read_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]
 
 
 _SURVEYS_BY_KIND = {"recording": _survey_recordings, "stacks": _survey_stacks, "pictures": _survey_loose_pictures}
-
-
-def _pick_evenly(items: Sequence[Path], count: int) -> list[Path]:
-    n = len(items)
-    return [items[i] for i in sorted({round(k * (n - 1) / max(count - 1, 1)) for k in range(count)})] if n else []
 
 
 # ------------------------------------------------------------------------------------------------------------- output

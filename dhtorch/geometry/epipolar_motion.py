@@ -16,6 +16,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import robust_loss
+from dhtorch.geometry.map_estimate import MEDIAN_1D
 from dhtorch.geometry.se3 import Pose
 
 #: Steps of the search for a direction of translation, a count. Source: chosen on built-in rooms of seeds 40 and 41.
@@ -30,9 +31,6 @@ EPIPOLAR_DAMPING = 1e-9
 
 #: Least sine between a ray and the translation: nearer ones have no epipolar line. Source: derived, 3 degrees.
 MIN_SINE = 0.05
-
-#: Median absolute value of a Gaussian with unit sigma. Source: derived, the normal quantile of 3/4.
-MEDIAN_NORMAL = 0.6745
 
 #: Length of an inlier's distance, in standard deviations. Source: derived, one in 370 Gaussian numbers lies beyond.
 EPIPOLAR_INLIER_SIGMAS = 3.0
@@ -87,7 +85,7 @@ def fit_epipolar_motion(
     ahead = ((b - x * (x * b).sum(1, keepdim=True)) * s[..., None] * weight[:, None]).sum((1, 2))
     s = torch.where(ahead[:, None] < 0, -s, s)  # points lie in front of both cameras
     inside = used & (distance.abs() < MAX_EPIPOLAR_DISTANCE_PX)
-    noise = masked_median(distance.abs(), inside)[:, 0] / MEDIAN_NORMAL
+    noise = masked_median(distance.abs(), inside)[:, 0] / MEDIAN_1D
     inlier = inside & (distance.abs() < EPIPOLAR_INLIER_SIGMAS * noise[:, None])
     return EpipolarMotion(Pose(R, (R @ s[..., None])[..., 0]), noise, inlier)
 

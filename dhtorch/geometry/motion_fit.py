@@ -23,6 +23,7 @@ from dhtorch.geometry.least_squares import (
     robust_loss,
     solve_spd,
 )
+from dhtorch.geometry.map_estimate import MEDIAN_2D
 from dhtorch.geometry.se3 import Pose
 
 #: Bends of the robust kernel from coarse to fine, px: the first is wider than the scatter of a start from a median
@@ -47,9 +48,6 @@ AGREEING_SIGMAS = 3.0
 #: Share of the model's covariance that is added to the sandwich, which few groups understate.
 #: Source: chosen on moved cameras in built-in rooms of seeds 40 and 41: .70 of the errors within one sigma.
 MODEL_SHARE = 0.65
-
-#: Median length of a residual of two Gaussian coordinates with unit sigma. Source: derived, sqrt(2 log 2).
-MEDIAN_RAYLEIGH = 1.1774
 
 
 class Sightings(NamedTuple):
@@ -130,7 +128,7 @@ def _noise(r: Tensor, usable: Tensor) -> Tensor:
     """Noise (B,) of a coordinate, px, from the median length of the residuals that are no outliers."""
     length = r.square().sum(1).sqrt()
     median = masked_median(length, usable & (length < 3 * FIT_BENDS_PX[-1]))[:, 0]
-    return (median / MEDIAN_RAYLEIGH).clamp(*NOISE_RANGE_PX)
+    return (median / MEDIAN_2D).clamp(*NOISE_RANGE_PX)
 
 
 def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:

@@ -37,6 +37,7 @@ from dhtorch.codes import Gate, Source, State, WrongCause
 from dhtorch.extract import plan
 from dhtorch.extract.enriched import map_columns
 from dhtorch.geometry import se3
+from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.records import Camera, Frame, Pose
 
 # ------------------------------------------------------------------------------------------------------------- enrich
@@ -323,7 +324,7 @@ def test_any_first_part_of_an_order_is_spread_evenly(n):
 def test_frames_are_picked_from_the_middle_of_their_parts():
     assert recover_pictures._pick_evenly(list(range(10)), 2) == [2, 7]
     assert recover_pictures._pick_evenly([3, 4], 5) == [3, 4]
-    assert inspect._pick_evenly(list("abcdefg"), 3) == ["a", "d", "g"] and inspect._pick_evenly([], 3) == []
+    assert spread_evenly(list("abcdefg"), 3) == ["a", "d", "g"] and spread_evenly([], 3) == []
     assert pin._spread(10, 4) == [0, 2, 5, 7] and pin._spread(3, None) == pin._spread(3, 5) == [0, 1, 2]
 
 

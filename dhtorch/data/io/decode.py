@@ -31,6 +31,8 @@ MAX_PIXELS = 64_000_000
 MAX_FILE_BYTES = 256_000_000
 #: Largest size in bytes of a table or a JSON document.
 MAX_TEXT_BYTES = 64_000_000
+#: Suffixes of images, tried where a format may leave out theirs.
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 #: Numbers shown in an error message.
 _MAX_NUMBERS_SHOWN = 64
 

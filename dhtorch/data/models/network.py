@@ -11,7 +11,7 @@ import numpy as np
 from dhtorch.data.codecs.npy import list_npz, read_npz
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.models.scene_model import IMAGE_SUFFIXES, ModelView, SceneModel, Similarity, find_picture
+from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, find_picture
 from dhtorch.runtime import storage
 
 #: Names of arrays in files of networks: VGGT, Depth Anything 3, MapAnything, DUSt3R and MASt3R.
@@ -69,7 +69,9 @@ def _names_of_arrays(
     if n_archives > 1:
         return [archive.stem]
     folder = pictures if pictures is not None else (root if root.is_dir() else root.parent) / "images"
-    present_files = [file for file in folder.glob("*") if file.suffix in IMAGE_SUFFIXES] if folder.is_dir() else []
+    present_files = (
+        [file for file in folder.glob("*") if file.suffix in files.IMAGE_SUFFIXES] if folder.is_dir() else []
+    )
     return sorted(present_files, key=files.natural_sort_key) or None
 
 

@@ -19,9 +19,6 @@ from dhtorch.records import Camera
 from dhtorch.runtime import storage
 from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
 
-#: Suffixes of pictures of a model, of which files may leave out theirs.
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-
 #: A model point is seen in a picture unless another one is nearer by this fraction within a cell of so many cells
 #: across. Source: origin not recorded.
 _OCCLUSION_REL, _OCCLUSION_CELLS = 0.05, 48
@@ -134,7 +131,7 @@ def find_picture(folder: Path, name: str, pictures: Path | None) -> Path | None:
     """File of a picture below ``images/`` of the folder or up to two folders above it; None where there is none."""
     above = [folder, *folder.resolve().parents[:2]]
     for base in [pictures] if pictures is not None else [f / sub for f in above for sub in ("images", "rgb", "color")]:
-        for suffix in ("", *IMAGE_SUFFIXES):
+        for suffix in ("", *files.IMAGE_SUFFIXES):
             file = files.resolve_inside(base, name + suffix, folder, "picture")
             if file.is_file():
                 return file

@@ -50,9 +50,6 @@ _UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
 #: Name of the map of origins that ``dhtorch enrich`` adds.
 _ORIGIN_KEY = "dhtorch_source_file_path"
 
-#: Suffixes tried for a ``file_path`` without one.
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-
 #: Largest error of the rotation in ``applied_transform`` that is rounding. Source: chosen on: six printed digits.
 _MAX_ROTATION_ERROR = 1e-4
 
@@ -134,9 +131,9 @@ def find_transforms(root: Path) -> Path | None:
 def resolve_image(folder: Path, entry: Mapping[str, Any], file: Path, k: int) -> Path:
     """Path of an image; a name without suffix gets that of the file that exists."""
     image = _resolve(folder, files.get_entry(entry, "file_path", str, file), file, f"frames.{k}.file_path")
-    if image.is_file() or image.suffix in _IMAGE_SUFFIXES:
+    if image.is_file() or image.suffix in files.IMAGE_SUFFIXES:
         return image
-    named = (image.with_name(image.name + suffix) for suffix in _IMAGE_SUFFIXES)
+    named = (image.with_name(image.name + suffix) for suffix in files.IMAGE_SUFFIXES)
     return next((candidate for candidate in named if candidate.is_file()), image)
 
 

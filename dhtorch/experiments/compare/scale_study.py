@@ -39,6 +39,7 @@ from dhtorch.geometry.sensor_noise import SENSORS, SensorNoise
 from dhtorch.measure.scale import metric_scale
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.records import Frame
 from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -175,15 +176,15 @@ def open_scale_room(seed: int, n_frames: int) -> ScaleScene:
 
 def _open(scene: Scene, max_frames: int) -> ScaleScene:
     recording = scene.recording
-    chosen = np.unique(np.linspace(0, len(recording) - 1, min(max_frames, len(recording))).round().astype(int))
-    frames = [recording[int(i)] for i in chosen]
+    chosen = spread_evenly(range(len(recording)), max_frames)
+    frames = [recording[i] for i in chosen]
     exact = isinstance(recording, TruthRecording)
     depth = []
     for i, frame in zip(chosen, frames, strict=True):
         hw = _model_hw(frame.hw)
         uv = regular_grid_of(hw, frame.hw)
         if isinstance(recording, TruthRecording):
-            z = sample_nearest(recording.truth(int(i))["depth"], uv)[0]
+            z = sample_nearest(recording.truth(i)["depth"], uv)[0]
         else:
             own = (frame.depth.shape[-2], frame.depth.shape[-1])
             z = sample_nearest(frame.depth, cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, own, uv))[0]
