@@ -33,7 +33,7 @@ TESTS: dict[str, list[str]] = {
     "measure.pin": PIN,
     "measure.scale": SCALE,
     "metrics.camera_paths": ["tests/metrics/test_grouped.py"],
-    "metrics.change_points": PIN,
+    "metrics.change_points": ["tests/metrics/test_change_points.py", *PIN],
     "metrics.grouped": ["tests/metrics/test_grouped.py"],
     "pipeline.picture_matching": ["tests/cli/test_numbers.py", *SCALE],
     "viz.plots.axis": PLOTS,
@@ -143,7 +143,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "geometry.epipolar_motion": [
         ("fit_epipolar_motion", "torch.where(ahead[:, None] < 0, -s, s)", "s"),
-        ("fit_epipolar_motion", "robust / sine**2", "robust / sine"),
+        ("_epipolar_step", "tangent @ a), 1)", "-tangent @ a), 1)"),
         ("fit_epipolar_motion", "used & (distance.abs()", "~used & (distance.abs()"),
     ],
     "geometry.motion_fit": [

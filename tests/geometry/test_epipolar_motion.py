@@ -1,5 +1,6 @@
 """Motion up to scale from rays: rotation and direction of a motion that is known."""
 
+import pytest
 import torch
 
 from dhtorch.geometry import se3
@@ -7,9 +8,10 @@ from dhtorch.geometry.epipolar_motion import fit_epipolar_motion
 from dhtorch.geometry.se3 import Pose
 
 
-def test_epipolar_motion_finds_direction_and_rotation():
+@pytest.mark.parametrize("sign", [1, -1])
+def test_epipolar_motion_finds_direction_and_rotation(sign):
     draw = torch.Generator().manual_seed(0)
-    T = se3.exp(torch.tensor([[0.02, -0.01, 0.03, 0.08, -0.05, 0.06]], dtype=torch.float64))
+    T = se3.exp(torch.tensor([[0.02, -0.01, 0.03, *(sign * x for x in (0.08, -0.05, 0.06))]], dtype=torch.float64))
     ray = torch.cat((torch.rand(1, 2, 200, generator=draw) - 0.5, torch.ones(1, 1, 200)), 1).double()
     Y = se3.apply(T, (ray * (1 + 2 * torch.rand(1, 1, 200, generator=draw).double())).mT).mT
     f, c = torch.full((1, 2), 500.0, dtype=torch.float64), torch.full((1, 2), 320.0, dtype=torch.float64)
