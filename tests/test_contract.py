@@ -735,7 +735,7 @@ ELSEWHERE = {
     *(f"dhtorch.stages.track_chain.{name}" for name in ("frames_between", "images_used")),
     *(
         f"dhtorch.geometry.reprojection_problem.{name}"
-        for name in ("pose_normal_equations_at", "minimise_tracks", "noise_from_medians")
+        for name in ("pose_normal_equations_at", "minimise_tracks", "noise_from_medians", "sandwich_sums")
     ),
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"

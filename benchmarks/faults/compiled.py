@@ -9,6 +9,11 @@ def _of(*names: str) -> list[str]:
 
 TESTS: dict[str, list[str]] = {
     "ops.csrc.pose": _of("a_pose_from_near_points_agrees_up_to_rounding", "the_reasons_for_no_pose_agree"),
+    "ops.csrc.lens": _of("pixels_of_a_lens_are_the_same_bits"),
+    "ops.csrc.linear": _of("solutions_of_small_systems_agree_up_to_rounding"),
+    "ops.csrc.parallax": _of(
+        "triangulated_tracks_agree_up_to_rounding", "costs_of_depth_profiles_agree_up_to_rounding"
+    ),
     "ops.csrc.pyramid": _of("pyramids_agree_up_to_one_rounding"),
     "ops.csrc.search": _of("a_search_for_points_agrees_up_to_rounding"),
     "ops.csrc.sweep": _of(
@@ -17,7 +22,7 @@ TESTS: dict[str, list[str]] = {
         "places_codes_and_smooth_maps_are_equal",
     ),
     "ops.csrc.tokens": _of("tokens_are_the_same_bits", "whole_depths_in_metres_are_the_same_bits"),
-    "ops.csrc.tracks": _of("equations_of_tracks_agree_up_to_rounding"),
+    "ops.csrc.tracks": _of("equations_of_tracks_agree_up_to_rounding", "covariances_of_poses_agree_up_to_rounding"),
     "ops.csrc.windows": _of(
         "numbers_about_windows_agree_textures_up_to_rounding",
         "samples_and_holes_are_the_same_bits",
@@ -33,6 +38,26 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("axes", "cross(normal, first, third);", "cross(first, normal, third);"),
         ("p3p", "t -= R * X[0][c];", "t += R * X[0][c];"),
         ("take", "from[4 * N + of[k]] - c[1]) / fy", "from[4 * N + of[k]] - c[1]) / fx"),
+    ],
+    "ops.csrc.lens": [
+        ("distort", "b = 2.0f * (y * (along + p2) + x * p1);", "b = 2.0f * (y * (along + p1) + x * p2);"),
+        ("distort", "radial = radial / denominator;", ""),
+        ("undistort", "moving = moving & (", "moving = ("),
+        ("undistort", "data<float>(distortion) + count * k", "data<float>(distortion)"),
+        ("undistort_jacobian", "focal[1] * b / focal[0]", "focal[0] * b / focal[1]"),
+    ],
+    "ops.csrc.linear": [
+        ("factor", "square -= row[k] * row[k]", "square += row[k] * row[k]"),
+        ("solve_spd", "sound = sound && std::isfinite", "sound = std::isfinite"),
+        ("solve_spd", "(first[i] + rest[i]) * scale[i]", "(first[i] + rest[i]) / scale[i]"),
+        ("solve_spd", "data<double>(b) + n * columns * k", "data<double>(b)"),
+    ],
+    "ops.csrc.parallax": [
+        ("triangulate", "stretch = ratio * ratio", "stretch = ratio"),
+        ("triangulate", "row[6] = gy * Y - py * Z;", "row[6] = gx * Y - py * Z;"),
+        ("triangulate", "own_c = data<float>(c_0) + 2 * k", "own_c = data<float>(c_0)"),
+        ("add_costs", "rel[n + i] * (moved * moved)", "rel[n + i] * moved"),
+        ("profile_cost", "scale = fitted > 0 ? fitted : scale;", "scale = fitted;"),
     ],
     "ops.csrc.pyramid": [
         ("grey", "luma(unit(r[x]), unit(g[x]), unit(b[x]))", "luma(unit(b[x]), unit(g[x]), unit(r[x]))"),
@@ -71,9 +96,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "ops.csrc.tracks": [
         ("equations", "H[j * n + i] = *from++", "H[i * n + j] = *from++"),
         ("sums", "weight / (bent * bent)", "weight / bent"),
-        ("sums", "W * J[1][i]", "W * J[0][i]"),
-        ("sums", "J[i][j - 6] * at.height", "J[i][j - 6]"),
-        ("pair", "data<float>(seen) + 2 * N * k", "data<float>(seen)"),
+        ("sums", "W * of_track.J[1][i]", "W * of_track.J[0][i]"),
+        ("Jacobian", "J[i][j - 6] * at.height", "J[i][j - 6]"),
+        ("pair", "data<T>(x.seen) + 2 * N * k", "data<T>(x.seen)"),
+        ("factors", "omega * omega * (spread", "omega * (spread"),
+        ("pose_sandwich", "w[i] * w[i] * scatter", "w[i] * scatter"),
+        ("pose_sandwich", "data<double>(far_weight)[k]", "data<double>(far_weight)[0]"),
         ("squared_residuals", "data<bool>(front)[N * k + m + i]", "data<bool>(front)[N * k + i]"),
     ],
     "ops.csrc.windows": [

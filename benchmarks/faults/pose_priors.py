@@ -50,7 +50,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_is_misaligned", "rejected | (gain", "(gain"),
         ("_is_misaligned", "rejected = rejected | (gain", "rejected = rejected & (gain"),
         ("_is_misaligned", "& (fit.t_snr >= min_t_snr)", ""),
-        ("_profile_cost", "(COST_BEND**2 / (COST_BEND**2 + square)) ** 2", "1"),
+        ("_mean_cost", "(COST_BEND**2 / (COST_BEND**2 + square)) ** 2", "1"),
         ("_near_parallax", "used = tracked & samples.usable", "used = samples.usable"),
     ],
     "geometry.pose_conventions": [

@@ -18,6 +18,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.checks import all_known, check, constant
 from dhtorch.geometry.linalg import inverse_2x2
 from dhtorch.geometry.se3 import Pose
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
@@ -27,6 +28,13 @@ if TYPE_CHECKING:
 #: Numbers of coefficients that a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
 #: Source: OpenCV calibrateCamera, distortion models without thin prism and tilt.
 COEFFICIENTS = (4, 5, 8)
+
+#: Limits the distance between a pixel and the distorted image of its ideal pixel, px: converged below, at any focal
+#: length. Source: origin not recorded.
+MAX_RETURN_ERROR_PX = 0.01
+
+#: Limits the magnitude of a lens's Jacobian determinant from below, without unit. Source: origin not recorded.
+MIN_DETERMINANT = 1e-12
 
 
 @record
@@ -205,15 +213,33 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
     check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
-    target = _planes(_normalised(camera, uv))
+    _check_coefficient_count(camera.distortion)
+    return _undistort(uv, camera.f, camera.c, camera.distortion, iterations=iterations)
+
+
+def _undistort_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iterations: int) -> Tensor:
+    lens = f.contiguous(), c.contiguous(), distortion.contiguous()
+    ideal_uv = torch.empty_like(uv, memory_format=torch.contiguous_format)
+    limits = torch.finfo(uv.dtype).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT
+    torch.ops.dhtorch.undistort.default(uv.contiguous(), *lens, ideal_uv, iterations, *limits)
+    return ideal_uv
+
+
+#: What the kernels of this module read: pixels (B, N, 2), f and c (B, 2), distortion (B, k).
+_LENS_DTYPES = dict.fromkeys(("uv", "f", "c", "distortion"), torch.float32)
+
+
+@operator(kernel=_undistort_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+def _undistort(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iterations: int) -> Tensor:
+    """:func:`undistort` of pixels of a camera with a lens."""
+    target = _planes((uv - c[:, None]) / f[:, None])
     with torch.no_grad():
-        xy = _solve_undistortion(camera.distortion, target.detach(), iterations)
-        residual = (_distort(camera.distortion, xy)[0] - target).abs().amax(0)
-        # A pixel has converged when it returns to itself within a hundredth of a pixel, at any focal length.
-        converged = residual * camera.f.amax(-1)[:, None] < 0.01
+        xy = _solve_undistortion(distortion, target.detach(), iterations)
+        residual = (_distort(distortion, xy)[0] - target).abs().amax(0)
+        converged = residual * f.amax(-1)[:, None] < MAX_RETURN_ERROR_PX
         detached = torch.where(converged, xy, 0.0)
-    xy = detached + _newton_step(camera.distortion, detached, torch.where(converged, target, 0.0))
-    uv = xy.movedim(0, -1) * camera.f[:, None] + camera.c[:, None]
+    xy = detached + _newton_step(distortion, detached, torch.where(converged, target, 0.0))
+    uv = xy.movedim(0, -1) * f[:, None] + c[:, None]
     return torch.where(converged[..., None], uv, torch.nan)
 
 
@@ -242,9 +268,23 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     if camera.distortion is None:
         eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
         return eye.expand(*uv_ideal.shape, 2)
-    a, b, c = _distort(camera.distortion, _planes(_normalised(camera, uv_ideal)))[1]
-    f = camera.f[:, None]
-    inverse = inverse_2x2(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
+    _check_coefficient_count(camera.distortion)
+    return _undistort_jacobian(uv_ideal, camera.f, camera.c, camera.distortion)
+
+
+def _undistort_jacobian_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor) -> Tensor:
+    inputs = [x.contiguous() for x in (uv, f, c, distortion)]
+    J = uv.new_empty(*uv.shape, 2)
+    torch.ops.dhtorch.undistort_jacobian.default(*inputs, J, MIN_DETERMINANT)
+    return J
+
+
+@operator(kernel=_undistort_jacobian_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+def _undistort_jacobian(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor) -> Tensor:
+    """:func:`undistort_jacobian` of a camera with a lens."""
+    f = f[:, None]
+    a, b, d = _distort(distortion, _planes((uv - c[:, None]) / f))[1]
+    inverse = inverse_2x2(a, b, b, d, least=MIN_DETERMINANT).movedim(0, -1).unflatten(-1, (2, 2))
     return f[..., :, None] * inverse / f[..., None, :]
 
 
@@ -293,7 +333,7 @@ def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
     """Newton step (2, B, N) to be added to the planes ``xy``."""
     value, (a, b, c) = _distort(distortion, xy)
     residual = target - value
-    a, b, _, c = inverse_2x2(*(x.detach() for x in (a, b, b, c)), least=1e-12)
+    a, b, _, c = inverse_2x2(*(x.detach() for x in (a, b, b, c)), least=MIN_DETERMINANT)
     return torch.stack((a * residual[0] + b * residual[1], b * residual[0] + c * residual[1]))
 
 

@@ -20,6 +20,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.determinism import chunk_size, pad_elementwise
 from dhtorch.geometry.linalg import quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
+from dhtorch.ops.dispatch import operator
 
 #: Limits the points of all pairs that :func:`triangulate_depth` processes at once, a count: torch does not split so few
 #: over threads.
@@ -63,9 +64,30 @@ def triangulate(
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
     check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
-    direction = _rotated_rays(uv_0, camera_0, T_1_from_0)
-    depth = _triangulated_depth(direction, uv_1, camera_1, T_1_from_0)
-    return _two_view(depth, torch.stack(direction, -1), uv_1, camera_1, T_1_from_0)
+    return _triangulate(uv_0, uv_1, camera_0.f, camera_0.c, camera_1.f, camera_1.c, T_1_from_0.R, T_1_from_0.t)
+
+
+def _triangulate_kernel(*tensors: Tensor) -> TwoView:
+    uv_0 = tensors[0]
+    depth, depth_1, parallax, residual = (uv_0.new_empty(uv_0.shape[:2]) for _ in range(4))
+    slope, J_pose = uv_0.new_empty(uv_0.shape), uv_0.new_empty(*uv_0.shape, 6)
+    geometry = TwoView(depth, depth_1, parallax, residual, slope, J_pose)
+    torch.ops.dhtorch.triangulate.default(*(x.contiguous() for x in tensors), *geometry)
+    return geometry
+
+
+#: What the kernel reads: pixels (B, N, 2), f and c (B, 2) px of both cameras, the pose.
+_TRIANGULATE_DTYPES = dict.fromkeys(("uv_0", "uv_1", "f_0", "c_0", "f_1", "c_1", "R", "t"), torch.float32)
+
+
+@operator(kernel=_triangulate_kernel, dtypes=_TRIANGULATE_DTYPES, any_layout=tuple(_TRIANGULATE_DTYPES))
+def _triangulate(*tensors: Tensor) -> TwoView:
+    """:func:`triangulate` of pixels, intrinsics and a pose."""
+    uv_0, uv_1, f_0, c_0, f_1, c_1, R, t = tensors
+    camera_1, T = Camera(f_1, c_1), Pose(R, t)
+    direction = _rotated_rays(uv_0, Camera(f_0, c_0), T)
+    depth = _triangulated_depth(direction, uv_1, camera_1, T)
+    return _two_view(depth, torch.stack(direction, -1), uv_1, camera_1, T)
 
 
 def triangulate_depth(

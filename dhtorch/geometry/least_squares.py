@@ -21,6 +21,7 @@ from torch.utils import _pytree as pytree
 from dhtorch.geometry.checks import all_known, check
 from dhtorch.geometry.linalg import small_matmul, solve_cholesky
 from dhtorch.geometry.se3 import Pose
+from dhtorch.ops.dispatch import operator
 
 #: Limits the depth of a point in front of a camera from below, m.
 #: Source: origin not recorded.
@@ -211,8 +212,23 @@ def solve_spd(
 
     Gradient: exact to H and b, first order only; zero where not ok.
     """
-    n = check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))["n"]
-    A, rhs = H.double(), b.double()
+    check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))
+    x, ok = _solve(H.double(), b.double())
+    return x.to(b.dtype), ok
+
+
+def _solve_kernel(H: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    x = torch.empty_like(b, memory_format=torch.contiguous_format)
+    ok = torch.empty_like(H[:, 0, 0], dtype=torch.bool, memory_format=torch.contiguous_format)
+    torch.ops.dhtorch.solve_spd.default(H.contiguous(), b.contiguous(), x, ok, MIN_PIVOT)
+    return x, ok
+
+
+@operator(kernel=_solve_kernel, dtypes={"H": torch.float64, "b": torch.float64}, any_layout=("H", "b"))
+def _solve(H: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`solve_spd` in float64."""
+    n = H.shape[-1]
+    A, rhs = H, b
     if n % 2:
         # The rounding of LAPACK depends on memory alignment: padded to a multiple of 4, a batch is aligned alike.
         padding = -n % 4
@@ -232,7 +248,7 @@ def solve_spd(
         rhs = rhs.masked_fill(singular, 0.0)
     start = solve_cholesky(rhs.detach(), L)
     x = start + solve_cholesky(rhs - small_matmul(A, start), L)
-    return (x * s)[:, :n].to(b.dtype), ok
+    return (x * s)[:, :n], ok
 
 
 def implicit_step(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -25,11 +25,13 @@ from dhtorch.geometry.least_squares import (
 )
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.reprojection_problem import (
+    LinearisedTracks,
     PoseDepthProblem,
     Unknowns,
     linearise_tracks,
     minimise_tracks,
     noise_from_medians,
+    sandwich_sums,
     shutter_prior,
     squared_residuals,
     squared_residuals_at,
@@ -64,6 +66,9 @@ N_POSE_PARAMETERS = 6
 #: Least ratio of mean psi′ to mean w, without unit: residuals all beyond the bend would make it negative.
 #: Source: origin not recorded.
 MIN_PSI_SLOPE = 0.1
+
+#: Limits a mean weight that is divided by from below, without unit. Source: origin not recorded.
+MIN_WEIGHT_DIVISOR = 1e-9
 
 #: Fractions of the near tracks, nearest first, that alone may show a translation, without unit.
 #: Source: origin not recorded.
@@ -279,19 +284,16 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     Source: P. Huber, "Robust Statistics", 1981, section 7.6; of the blocks H. Künsch, "The jackknife and the bootstrap
     for general stationary observations", 1989, with a linear step in place of a new solution.
     """
-    linear = linearise_tracks(problem, solution.at)
-    square = squared_residuals(problem, linear, solution.noise)
-    _, weight = robust_loss(square, o.kernel, o.bend)
-    bread, meat = torch.zeros_like(square), torch.zeros_like(square)
-    near_weight = torch.ones_like(solution.far_weight)
-    for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
-        used = mask & linear.front
-        rise, scatter = _rise_and_scatter(square, weight, used, size, o)
-        bread = torch.where(used, weight * (omega * rise)[:, None], bread)
-        meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
-    rows = whitened_residuals(problem, linear, solution.noise).double()
-    A, _ = normal_equations(rows, bread.double(), block=SUM_LANES)
-    M, _ = normal_equations(rows, meat.double(), block=SUM_LANES)
+    parts = _SandwichParts(problem, solution, o)
+    A, M = sandwich_sums(
+        problem,
+        solution.at,
+        solution.noise,
+        solution.far_weight,
+        robust=(o.kernel, o.bend),
+        reference=parts.sums,
+        limits=(MIN_PSI_SLOPE, N_POSE_PARAMETERS, MIN_WEIGHT_DIVISOR),
+    )
     precision = o.shutter_sigma**-2 if o.shutter_sigma > 0 else GLOBAL_SHUTTER_PRECISION
     prior = torch.diag_embed(shutter_prior(torch.full_like(solution.shutter_precision, precision).double()))
     A, M = A + prior, M + prior
@@ -299,10 +301,49 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     whole = small_matmul(small_matmul(inverse, M), inverse)
     whole = 0.5 * (whole + whole.transpose(1, 2))
     if o.blocks is not None:
-        used = problem.near & linear.front
-        steps = _steps_without_blocks(rows, bread, weight, _blocks_of(problem.ray, used, *o.blocks), solution)
+        used = problem.near & parts.linear.front
+        blocks = _blocks_of(problem.ray, used, *o.blocks)
+        steps = _steps_without_blocks(parts.rows, parts.weights[1], parts.weights[0], blocks, solution)
         whole = whole * _scatter_ratio(steps, whole, ok, solution)[:, None, None]
     return whole, ok
+
+
+class _SandwichParts:
+    """What the sandwich and the jackknife of :func:`pose_covariance` add up, computed when first read."""
+
+    def __init__(self, problem: PoseDepthProblem, solution: MapSolution, o: FitOptions) -> None:
+        self.problem, self.solution, self.o = problem, solution, o
+
+    @cached_property
+    def linear(self) -> LinearisedTracks:
+        return linearise_tracks(self.problem, self.solution.at)
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """Whitened rows (B, 10, 2, N)."""
+        return whitened_residuals(self.problem, self.linear, self.solution.noise).double()
+
+    @cached_property
+    def weights(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Robust weight w of each track (B, N), and its weights in bread and meat."""
+        problem, solution, o = self.problem, self.solution, self.o
+        square = squared_residuals(problem, self.linear, solution.noise)
+        _, weight = robust_loss(square, o.kernel, o.bend)
+        bread, meat = torch.zeros_like(square), torch.zeros_like(square)
+        near_weight = torch.ones_like(solution.far_weight)
+        for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
+            used = mask & self.linear.front
+            rise, scatter = _rise_and_scatter(square, weight, used, size, o)
+            bread = torch.where(used, weight * (omega * rise)[:, None], bread)
+            meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
+        return weight, bread, meat
+
+    def sums(self) -> tuple[Tensor, Tensor]:
+        """Bread and meat (B, 9, 9)."""
+        _, bread, meat = self.weights
+        A, _ = normal_equations(self.rows, bread.double(), block=SUM_LANES)
+        M, _ = normal_equations(self.rows, meat.double(), block=SUM_LANES)
+        return A, M
 
 
 def _blocks_of(ray: Tensor, used: Tensor, across: int, down: int) -> Tensor:
@@ -371,6 +412,6 @@ def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o
     free = size * count
     few = 1 + N_POSE_PARAMETERS / free * uneven
     spent = free / (free - N_POSE_PARAMETERS).clamp_min(1.0)
-    rise = mean / (total(weight) / count).clamp_min(1e-9)
-    scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
+    rise = mean / (total(weight) / count).clamp_min(MIN_WEIGHT_DIVISOR)
+    scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(MIN_WEIGHT_DIVISOR)
     return rise.clamp_min(MIN_PSI_SLOPE) / few, scatter * spent * spent

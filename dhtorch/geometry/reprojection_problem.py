@@ -313,6 +313,13 @@ def _kernel_arguments(*tensors: Any) -> tuple[Tensor, ...]:
     return *tracks, R.contiguous(), t.contiguous(), rate
 
 
+#: Dtypes of numbers in kernels in single and in double precision.
+_FLOATS = torch.float32, torch.float64
+
+#: :data:`_TRACK_DTYPES` of such kernels.
+_ANY_PRECISION = {name: dtype if dtype == torch.bool else _FLOATS for name, dtype in _TRACK_DTYPES.items()}
+
+
 def _has_whole_lanes(ray: Tensor, *_: Tensor | None, **__: Any) -> bool:
     """Whether the number of tracks is a multiple of the kernel's vector width."""
     return ray.shape[-1] % SUM_LANES == 0
@@ -508,9 +515,10 @@ def minimise_tracks(
 _Robust = tuple[str | None, float]
 
 
-def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, robust: _Robust, **__: Any) -> bool:
-    """Whether the compiled kernels implement the robust kernel and divide the number of tracks."""
-    return robust[0] == "geman_mcclure" and _has_whole_lanes(ray)
+def _is_geman_mcclure(*tensors: Any, robust: _Robust, **_: Any) -> bool:
+    """Whether the compiled kernels implement the robust kernel, divide the number of tracks and fit the precision."""
+    is_one_precision = len({x.dtype for x in tensors if x is not None} - {torch.bool}) == 1
+    return robust[0] == "geman_mcclure" and is_one_precision and _has_whole_lanes(tensors[0])
 
 
 def _minimum_kernel(
@@ -568,7 +576,7 @@ def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], rob
 
 @operator(
     kernel=_equations_kernel,
-    dtypes=_TRACK_DTYPES | {"share": torch.float32},
+    dtypes=_ANY_PRECISION | {"share": _FLOATS},
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
@@ -587,7 +595,7 @@ def _robust_cost_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], r
 
 @operator(
     kernel=_robust_cost_kernel,
-    dtypes=_TRACK_DTYPES | {"share": torch.float32},
+    dtypes=_ANY_PRECISION | {"share": _FLOATS},
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
@@ -595,6 +603,55 @@ def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: 
     """The cost (B,) of :func:`_equations` alone."""
     square = _squared_lengths(linear(), tensors[8:11])
     return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
+
+
+def sandwich_sums(
+    problem: PoseDepthProblem,
+    at: Unknowns,
+    noise: Tensor,  # (B, N) px²
+    far_weight: Tensor,  # (B,)
+    *,
+    robust: tuple[str | None, float],
+    reference: Callable[[], tuple[Tensor, Tensor]],
+    limits: tuple[float, float, float],
+) -> tuple[Tensor, Tensor]:
+    """Bread and meat (B, 9, 9) of the sandwich of ``map_estimate.pose_covariance``, compiled where it can be.
+
+    Args:
+        problem, at, noise, far_weight: as in :func:`pose_normal_equations`, with a shutter rate.
+        robust: name of the robust kernel and where it bends.
+        reference: the same in torch.
+        limits: least ratio of mean psi′ to mean w, degrees of freedom that the pose takes, least mean weight.
+
+    Gradient: none. Raises ValueError for wrong shapes.
+    """
+    constants, factors, _ = _fixed_tensors(problem, noise, far_weight)
+    tensors = _track_tensors(problem, constants, factors, at)
+    return _sandwich(*tensors, problem.far, far_weight, reference=reference, robust=robust, limits=limits)
+
+
+def _sandwich_kernel(
+    *tensors: Any, reference: Callable[[], tuple[Tensor, Tensor]], robust: _Robust, limits: tuple[float, float, float]
+) -> tuple[Tensor, Tensor]:
+    *tracks, far, far_weight = tensors
+    bread, meat = (far_weight.new_empty(len(far_weight), 9, 9) for _ in range(2))
+    numbers = robust[1], *limits, NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
+    torch.ops.dhtorch.pose_sandwich.default(*_kernel_arguments(*tracks), far, far_weight, bread, meat, *numbers)
+    return bread, meat
+
+
+@operator(
+    kernel=_sandwich_kernel,
+    dtypes={name: torch.bool if dtype == torch.bool else torch.float64 for name, dtype in _TRACK_DTYPES.items()}
+    | {"far": torch.bool, "far_weight": torch.float64},
+    any_layout=("R", "t", "shutter_rate"),
+    when=_is_geman_mcclure,
+)
+def _sandwich(
+    *tensors: Any, reference: Callable[[], tuple[Tensor, Tensor]], robust: _Robust, limits: tuple[float, float, float]
+) -> tuple[Tensor, Tensor]:
+    """:func:`sandwich_sums` of :func:`_track_tensors`, far tracks (B, N) and their weight (B,)."""
+    return reference()
 
 
 def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:

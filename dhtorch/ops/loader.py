@@ -57,7 +57,10 @@ INSTALLED = Path(__file__).with_name("lib")
 #: C++ sources of the library.
 SOURCES = tuple(
     FOLDER / f"{part}.cpp"
-    for part in ("sweep", "search", "affine", "pyramid", "fit", "windows", "tokens", "pose", "tracks")
+    for part in (
+        *("sweep", "search", "affine", "pyramid", "fit", "windows"),
+        *("tokens", "pose", "tracks", "lens", "linear", "parallax"),
+    )
 )
 
 #: Header that all sources include.

@@ -11,7 +11,7 @@ d(pixel of view 1) / dq along the epipolar line (px m), so that (q − p) a is t
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from dhtorch.geometry.checks import all_finite, any_possible, check, constant
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.map_estimate import MEDIAN_1D, MIN_NOISE_PX
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 
@@ -223,33 +224,61 @@ def _thinned(near: _Parallax) -> _Parallax:
 
 
 def _profile_cost(near: _Parallax, p: Tensor, used: Tensor, scale: Tensor | None) -> Tensor:
-    """Mean robust cost (…) of the residuals (q − s p) a of inverse depths p (…, N); s = 1, or fitted from ``scale``."""
-    square, variance = _square(near, p if scale is None else scale * p)
+    """Mean robust cost (B, K) of the residuals (q − s p) a of inverse depths p (B, K, N); s = 1, or fitted.
+
+    ``scale`` (B, K) is where the fit of s starts, ``used`` (B, K, N) which returns count.
+    """
+    return _mean_cost(near.q, near.a, near.variance_rel, near.noise, *(p, used, scale))
+
+
+def _mean_cost_kernel(*tensors: Any) -> Tensor:
+    *inputs, scale = tensors
+    p = inputs[4]
+    cost = p.new_empty(p.shape[:2])
+    start = p.new_empty(0, p.shape[1]) if scale is None else scale.contiguous()
+    torch.ops.dhtorch.profile_cost.default(*(x.contiguous() for x in inputs), start, cost, COST_BEND, SCALE_STEPS)
+    return cost
+
+
+#: What the kernel reads: fields of :class:`_Parallax` (B, N) and (B, 1), then the arguments of :func:`_profile_cost`.
+_COST_DTYPES = {
+    name: torch.bool if name == "used" else torch.float32
+    for name in ("q", "a", "variance_rel", "noise", "p", "used", "scale")
+}
+
+
+@operator(kernel=_mean_cost_kernel, dtypes=_COST_DTYPES, any_layout=tuple(_COST_DTYPES))
+def _mean_cost(*tensors: Any) -> Tensor:
+    """:func:`_profile_cost` of tensors."""
+    q, a, variance_rel, noise = (x[:, None] for x in tensors[:4])
+    p, used, scale = tensors[4:]
+    residuals = partial(_square, q, a, variance_rel, noise)
+    square, variance = residuals(p if scale is None else scale[..., None] * p)
     if scale is not None:
-        a_squared = near.a**2
+        scale, a_squared = scale[..., None], a**2
         for _ in range(SCALE_STEPS):
             weight = a_squared / variance * (COST_BEND**2 / (COST_BEND**2 + square)) ** 2
             weight = torch.where(used, weight, 0.0) * p
             total = (weight * p).sum(-1, keepdim=True)
-            fitted = (weight * near.q).sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+            fitted = (weight * q).sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
             scale = torch.where(fitted > 0, fitted, scale)
-            square, variance = _square(near, scale * p)
+            square, variance = residuals(scale * p)
     cost = torch.where(used, square / (COST_BEND**2 + square), 0.0)
     return cost.sum(-1) / used.sum(-1).clamp_min(1)
 
 
-def _square(near: _Parallax, p: Tensor) -> tuple[Tensor, Tensor]:
+def _square(q: Tensor, a: Tensor, variance_rel: Tensor, noise: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     """Squared residual along the epipolar line in variances, and its variance px²: track and sensor."""
-    variance = near.noise**2 + near.variance_rel * (p * near.a) ** 2
-    return ((near.q - p) * near.a) ** 2 / variance, variance
+    variance = noise**2 + variance_rel * (p * a) ** 2
+    return ((q - p) * a) ** 2 / variance, variance
 
 
 def _unexplained_ratio(near: _Parallax) -> Tensor:
     """Cost of the returned depths over that of one depth for all (B,)."""
-    one = torch.ones_like(near.p)
-    own = _profile_cost(near, near.p, near.used, None)
-    flat = _profile_cost(near, one, near.used, masked_median(near.q, near.used).clamp_min(1e-6))
-    return own / torch.where(flat > 0, flat, 1.0)
+    p, used = near.p[:, None], near.used[:, None]
+    own = _profile_cost(near, p, used, None)
+    flat = _profile_cost(near, torch.ones_like(p), used, masked_median(near.q, near.used).clamp_min(1e-6))
+    return (own / torch.where(flat > 0, flat, 1.0))[:, 0]
 
 
 def _attachment_gain(near: _Parallax, samples: Samples) -> tuple[Tensor, Tensor]:
@@ -264,11 +293,10 @@ def _attachment_gain(near: _Parallax, samples: Samples) -> tuple[Tensor, Tensor]
     has = has & inside.view(has.shape) & near.used[:, None]
     used = has[:, 1:] & has[:, :1]
     own, other = (torch.where(used, x, torch.ones_like(x)) for x in (p[:, :1].expand_as(used), p[:, 1:]))
-    own_sum, other_sum = (torch.where(used, x, 0.0).sum(-1, keepdim=True) for x in (own, other))
-    wide = _Parallax(*(x[:, None] for x in near))
-    own_cost = _profile_cost(wide, own, used, torch.ones_like(own_sum))
+    own_sum, other_sum = (torch.where(used, x, 0.0).sum(-1) for x in (own, other))
+    own_cost = _profile_cost(near, own, used, torch.ones_like(own_sum))
     scale = torch.where(other_sum > 0, own_sum / torch.where(other_sum > 0, other_sum, 1.0), 1.0)
-    cost = _profile_cost(wide, other, used, scale)
+    cost = _profile_cost(near, other, used, scale)
     n = used.sum(-1)
     testable = (n >= MIN_TESTED_RETURNS) & (n >= MIN_SHARED_RATIO * near.used.sum(-1, keepdim=True))
     testable = testable & (own_cost > MIN_OWN_COST)

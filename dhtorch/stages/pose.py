@@ -517,7 +517,7 @@ def _pose_depth_problem(
     padding = round_up(N, SUM_LANES) - N
 
     def plane(x: Tensor, value: float = 0.0) -> Tensor:
-        x = x.transpose(1, 2) if x.ndim == 3 else x
+        x = x.transpose(1, 2).contiguous() if x.ndim == 3 else x  # operators read contiguous planes
         return torch.nn.functional.pad(x, (0, padding), value=value)
 
     shape = torch.stack(upper_triangle(shape), 1)

@@ -24,6 +24,9 @@ from dhtorch import WINDOW, codes
 from dhtorch.codes import PoseCode, Source
 from dhtorch.geometry import (
     affine_alignment,
+    epipolar,
+    least_squares,
+    map_estimate,
     patches,
     plane_sweep,
     pyramid,
@@ -34,7 +37,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import (
     windows as neighbours,
 )
-from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
+from dhtorch.geometry.camera import Camera, from_matrix, project, undistort, undistort_jacobian, unproject
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.map_estimate import estimate_noise_variance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
@@ -44,7 +47,7 @@ from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
-from dhtorch.stages import pose
+from dhtorch.stages import misalignment, pose
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.pose import map_pose, pnp_ransac
@@ -819,16 +822,21 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
     for i in range(6):  # each column, whatever its unit
         torch.testing.assert_close(found[1][:, i, i], expected[1][:, i, i], rtol=1e-3, atol=0)
     ask(kernel="cauchy")
+    mixed = [told[0], told[1].double(), *told[2:]]
+    ask(told=mixed)
+    assert len(asked) == 2, "in torch"
     wide = [x.to(torch.float64) for x in told]
-    ask(
-        told=wide,
-        at=at._replace(
-            T=at.T.to(torch.float64), shutter_rate=None if at.shutter_rate is None else at.shutter_rate.double()
-        ),
+    rate = None if at.shutter_rate is None else at.shutter_rate.double()
+    found, expected = both_ways(
+        lambda: ask(told=wide, at=at._replace(T=at.T.to(torch.float64), shutter_rate=rate)), monkeypatch
     )
+    assert len(asked) == 4
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == torch.float64 and (a - b).abs().amax() <= 1e-11 * b.abs().amax()
+    asked.clear()
     leaf = at.T.t.clone().requires_grad_()
     assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
-    assert len(asked) == 2, "in torch"
+    assert not asked, "in torch"
     (square, front), (wanted, ahead) = both_ways(
         lambda: reprojection_problem.squared_residuals_at(problem, at)(noise), monkeypatch
     )
@@ -855,6 +863,110 @@ def test_minima_over_tracks_and_their_noise_agree_up_to_rounding(loaded, monkeyp
     found, expected = both_ways(lambda: estimate_noise_variance(problem, at), monkeypatch)
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
     assert [len(x) for x in asked] == [3, 1]
+
+
+@needs_compiler
+@pytest.mark.parametrize("far", [0.0, 0.1])
+def test_covariances_of_poses_agree_up_to_rounding(loaded, monkeypatch, far):
+    problem, at, noise = every_track(turning=True)
+    wide = problem.to(torch.float64)
+    at = at._replace(T=at.T.to(torch.float64), shutter_rate=at.shutter_rate.double())
+    weight = torch.tensor([far, 0.7], dtype=torch.float64)
+    solution = map_estimate.MapSolution(at, noise.double(), weight, 1e4 * weight, weight > 0)
+    asked = counted(monkeypatch, "pose_sandwich")
+    for options in (map_estimate.FitOptions(), map_estimate.FitOptions(bend=0.7, blocks=(2, 2))):
+        (found, ok), (expected, sound) = both_ways(
+            lambda o=options: map_estimate.pose_covariance(wide, solution, o), monkeypatch
+        )
+        assert ok.all() and sound.all()
+        size = expected.diagonal(dim1=1, dim2=2).sqrt()
+        assert ((found - expected) / (size[:, :, None] * size[:, None])).abs().amax() <= 1e-10
+    assert len(asked) == 2
+    map_estimate.pose_covariance(wide, solution, map_estimate.FitOptions(kernel="huber"))
+    assert len(asked) == 2, "in torch"
+
+
+@needs_compiler
+@pytest.mark.parametrize(("n", "columns"), [(6, 1), (6, 7), (9, 9), (3, 1)])
+def test_solutions_of_small_systems_agree_up_to_rounding(loaded, monkeypatch, n, columns):
+    g = torch.Generator().manual_seed(n)
+    rows = torch.randn(7, n + 4, n, generator=g, dtype=torch.float64)
+    H = (
+        rows.mT
+        @ rows
+        * torch.logspace(-3, 3, n, dtype=torch.float64)
+        * torch.logspace(-3, 3, n, dtype=torch.float64)[:, None]
+    )
+    b = torch.randn(7, n, columns, generator=g, dtype=torch.float64)
+    H[1, 0, 0], H[2, 1, 1], b[3, 0, 0], H[4] = torch.nan, -1.0, torch.inf, 0.0
+    H[5] = torch.ones(n, n)  # of rank one
+    asked = counted(monkeypatch, "solve_spd")
+    (x, ok), (expected, sound) = both_ways(lambda: least_squares.solve_spd(H, b), monkeypatch)
+    assert len(asked) == 1
+    assert torch.equal(ok, sound) and ok.tolist() == [True, *[False] * 5, True]
+    assert not x[~ok].any()
+    assert (x - expected).abs().amax() <= 1e-11 * expected.abs().amax()
+    assert least_squares.solve_spd(H.float(), b.float())[0].dtype == torch.float32
+    alone, _ = least_squares.solve_spd(H[6:], b[6:])
+    assert torch.equal(alone[0], x[6])
+    assert least_squares.solve_spd(H.requires_grad_(), b)[0].requires_grad
+
+
+@needs_compiler
+@pytest.mark.parametrize("coefficients", [4, 5, 8])
+def test_pixels_of_a_lens_are_the_same_bits(loaded, monkeypatch, coefficients):
+    """Those outside of the lens's model, and pixels that are no numbers, too."""
+    g = torch.Generator().manual_seed(coefficients)
+    lens = torch.tensor([[0.26, -0.95, -0.005, 0.002, 1.1, 0.1, 0.02, 0.01], [-0.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    camera = Camera(500 + 20 * torch.rand(2, 2, generator=g), torch.full((2, 2), 300.0), lens[:, :coefficients])
+    uv = 1000 * torch.rand(2, 301, 2, generator=g) - 150
+    uv[0, 0], uv[1, 3, 1] = torch.nan, torch.inf
+    asked = counted(monkeypatch, "undistort"), counted(monkeypatch, "undistort_jacobian")
+    found, expected = both_ways(lambda: undistort(camera, uv), monkeypatch)
+    assert 2 <= int(expected.isnan().any(-1).sum()) < 500
+    torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
+    found, expected = both_ways(lambda: undistort_jacobian(camera, uv[:, 4:]), monkeypatch)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    assert [len(x) for x in asked] == [1, 1]
+    assert torch.equal(undistort(camera[1:], uv[1:]).nan_to_num(), undistort(camera, uv)[1:].nan_to_num())
+    assert undistort(camera, uv.clone().requires_grad_()).requires_grad
+    with pytest.raises(ValueError, match="7 coefficients"):
+        undistort(camera.replace(distortion=torch.zeros(2, 7)), uv)
+
+
+@needs_compiler
+def test_triangulated_tracks_agree_up_to_rounding(loaded, monkeypatch):
+    _, tracks, camera, _, _ = near_pairs(3, 301, 0.2)
+    T = se3.exp(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1)))
+    T = T.replace(t=T.t * torch.tensor([[1.0], [1.0], [0.0]]))  # the last pair has no baseline
+    asked = counted(monkeypatch, "triangulate")
+    found, expected = both_ways(lambda: epipolar.triangulate(tracks.uv_0, tracks.uv_1, camera, camera, T), monkeypatch)
+    assert len(asked) == 1
+    for name, a, b in zip(expected._fields, found, expected, strict=True):
+        assert a.shape == b.shape, name
+        torch.testing.assert_close(a, b, rtol=2e-6, atol=2e-6, msg=lambda text, name=name: f"{name}: {text}")
+    leaf = tracks.uv_1.clone().requires_grad_()
+    assert epipolar.triangulate(tracks.uv_0, leaf, camera, camera, T).depth.requires_grad
+
+
+@needs_compiler
+@pytest.mark.parametrize("fitted", [False, True])
+def test_costs_of_depth_profiles_agree_up_to_rounding(loaded, monkeypatch, fitted):
+    g = torch.Generator().manual_seed(0)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=g)
+
+    q, a, p = 0.5 + uniform(2, 301), 50 * uniform(2, 301), 0.5 + uniform(2, 4, 301)
+    near = misalignment._Parallax(
+        uniform(2, 301, 2), q, q, a, variance_rel=0.01 * uniform(2, 301), noise=0.1 + uniform(2, 1), used=q > 0
+    )
+    used, scale = uniform(2, 4, 301) < 0.8, 0.5 + uniform(2, 4) if fitted else None
+    used[0, 0] = False
+    asked = counted(monkeypatch, "profile_cost")
+    found, expected = both_ways(lambda: misalignment._profile_cost(near, p, used, scale), monkeypatch)
+    assert len(asked) == 1 and found[0, 0] == 0
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
 
 
 @needs_compiler
