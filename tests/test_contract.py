@@ -342,6 +342,7 @@ ROWS = [
     Row(camera.project, lambda b, n, d: (cameras(b, d, True), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.unproject, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d), uniform(b, n, dtype=d, low=1)), ALL, (1, 2), (0, 1, 2), bad=wrong_last_axis(1), leaks=True),
     Row(camera.rays, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
+    Row(camera.ray_heights, lambda b, n, d: (cameras(b, d), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.distort, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.undistort, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.undistort_jacobian, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),

@@ -191,6 +191,12 @@ def rays(camera: Camera, uv: Tensor) -> Tensor:
     return unproject(camera, uv, torch.ones_like(uv[..., 0]))
 
 
+def ray_heights(camera: Camera, uv: Tensor) -> Tensor:
+    """The y (B, N) of the :func:`rays` through ideal pixels ``uv`` (B, N, 2). Gradient: to uv and intrinsics."""
+    check("camera.ray_heights", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
+    return (uv[..., 1] - camera.c[:, 1:]) / camera.f[:, 1:]
+
+
 def distort(camera: Camera, uv: Tensor) -> Tensor:
     """Pixels of the distorted image at ideal pixels (B, N, 2), by kornia. The inverse of :func:`undistort`."""
     check("camera.distort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))

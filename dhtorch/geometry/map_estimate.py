@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.reprojection_problem import (
     LinearisedTracks,
     PoseDepthProblem,
+    TrackConstants,
     Unknowns,
     linearise_tracks,
     minimise_tracks,
@@ -35,6 +36,7 @@ from dhtorch.geometry.reprojection_problem import (
     shutter_prior,
     squared_residuals,
     squared_residuals_at,
+    track_constants,
     whitened_residuals,
 )
 from dhtorch.geometry.se3 import Pose
@@ -157,36 +159,36 @@ def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> 
     Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the used tracks. Only their number depends on values.
     """
     full_problem, (problem, near_problem) = problem, _compact_problems(problem)
+    known, near_known = track_constants(problem), track_constants(near_problem)
     at = Unknowns(start, None)
     zero_rate = torch.zeros_like(start.t)
     no_far, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, GLOBAL_SHUTTER_PRECISION))
+    solve = partial(minimise_tracks, problem, kernel=o.kernel, bend=o.bend, known=known)
+    noise_at = partial(estimate_noise_variance, problem, known=known)
 
-    def solve(
-        at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: PoseDepthProblem = problem
-    ) -> tuple[Unknowns, Tensor]:
-        return minimise_tracks(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend, steps=steps)
-
-    half = o.near_steps // 2
-    near, _ = solve(at, estimate_noise_variance(near_problem, at), no_far, rigid, half, near_problem)
-    near, _ = solve(near, estimate_noise_variance(near_problem, near), no_far, rigid, o.near_steps - half, near_problem)
-    both, _ = solve(near, estimate_noise_variance(problem, near), far, rigid, o.steps)
-    noise, precision = estimate_noise_variance(problem, both), rigid
+    near, half = at, o.near_steps // 2
+    for steps in (half, o.near_steps - half):
+        noise = estimate_noise_variance(near_problem, near, known=near_known)
+        robust: dict[str, Any] = {"kernel": o.kernel, "bend": o.bend, "known": near_known}
+        near, _ = minimise_tracks(near_problem, near, noise, no_far, rigid, steps=steps, **robust)
+    both, _ = solve(near, noise_at(near), far, rigid, steps=o.steps)
+    noise, precision = noise_at(both), rigid
     if o.shutter_sigma > 0:
-        both, rigid_cost = solve(both, noise, far, rigid, o.steps // 2)
+        both, rigid_cost = solve(both, noise, far, rigid, steps=o.steps // 2)
         both = both._replace(shutter_rate=zero_rate)
         prior = torch.full_like(rigid, o.shutter_sigma**-2)
-        rolling, shutter_cost = solve(both, noise, far, prior, o.steps)
+        rolling, shutter_cost = solve(both, noise, far, prior, steps=o.steps)
         has_shutter = rigid_cost - shutter_cost > o.shutter_gain * rigid_cost + COST_SLACK
         both, precision = select_batch(has_shutter, rolling, both), torch.where(has_shutter, prior, rigid)
     near = near._replace(shutter_rate=zero_rate)
     both = both if o.shutter_sigma > 0 else both._replace(shutter_rate=zero_rate)
     near_noise = noise[:, : near_problem.near.shape[1]]
-    cost_near, cost_both = (_near_cost(near_problem, x, near_noise, o) for x in (near, both))
+    cost_near, cost_both = (_near_cost(near_problem, x, near_noise, o, near_known) for x in (near, both))
     accept_far = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
     at, precision = select_batch(accept_far, both, near), torch.where(accept_far, precision, rigid)
     far = torch.where(accept_far, far, no_far)
-    noise = estimate_noise_variance(problem, at)
-    translates = _translates(problem, at, noise, far, precision, o)
+    noise = noise_at(at)
+    translates = _translates(problem, at, noise, far, precision, o=o, known=known)
     of_near, of_far = (torch.where(kind, noise, 0.0).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
     noise = torch.where(full_problem.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
     return MapSolution(at, noise, far, precision, translates)
@@ -213,10 +215,17 @@ def _compact_problems(problem: PoseDepthProblem) -> tuple[PoseDepthProblem, Pose
 
 
 def _translates(
-    problem: PoseDepthProblem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions
+    problem: PoseDepthProblem,
+    at: Unknowns,
+    noise: Tensor,
+    far: Tensor,
+    precision: Tensor,
+    *,
+    o: FitOptions,
+    known: TrackConstants,
 ) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
-    solve = partial(minimise_tracks, problem, kernel=o.kernel, bend=o.bend, rotation_only=True)
+    solve = partial(minimise_tracks, problem, kernel=o.kernel, bend=o.bend, rotation_only=True, known=known)
     of_tracks = noise, far, precision
     without_t = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
     rotation_only, rotation_cost = solve(without_t, *of_tracks, steps=o.steps)  # the least t would be a baseline
@@ -224,7 +233,7 @@ def _translates(
     translates = rotation_cost - cost > o.translation_gain * rotation_cost + COST_SLACK
     if all_known(translates):
         return translates
-    costs = [_costs(problem, x, noise, o) for x in (rotation_only, at)]
+    costs = [_costs(problem, x, noise, o, known) for x in (rotation_only, at)]
     for fraction in NEAREST_FRACTIONS:
         in_nearest = _nearest_tracks(problem, fraction)
         weight = torch.where(in_nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
@@ -242,18 +251,20 @@ def _nearest_tracks(problem: PoseDepthProblem, fraction: float) -> Tensor:
 
 
 @torch.no_grad()
-def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int = 3) -> Tensor:
+def estimate_noise_variance(
+    problem: PoseDepthProblem, at: Unknowns, rounds: int = 3, known: TrackConstants | None = None
+) -> Tensor:
     """Variance (B, N) px² of a residual coordinate from medians; one for the near, one for the far tracks of a pair.
 
     Medians do not contain the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
-    the previous one.
+    the previous one. ``known`` is :func:`track_constants` of the problem where already computed.
     """
 
     limits = MIN_NOISE_PX**2, MAX_NOISE_PX**2
 
     def reference() -> Tensor:
         noise = torch.ones_like(problem.inverse)
-        square_of = squared_residuals_at(problem, at)
+        square_of = squared_residuals_at(problem, at, known)
         for _ in range(rounds):
             square, front = square_of(noise)
             size = square.sqrt()
@@ -265,7 +276,9 @@ def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int
         return noise
 
     medians = MEDIAN_2D, MEDIAN_1D
-    return noise_from_medians(problem, at, reference=reference, rounds=rounds, medians=medians, limits=limits)
+    return noise_from_medians(
+        problem, at, reference=reference, rounds=rounds, medians=medians, limits=limits, known=known
+    )
 
 
 @torch.no_grad()
@@ -384,15 +397,15 @@ def _scatter_ratio(steps: Tensor, covariance: Tensor, ok: Tensor, solution: MapS
     return ((K - 1) / K * (steps * whitened.mT).sum((1, 2)) / n_free).clamp_min(1.0)
 
 
-def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
+def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions, known: TrackConstants) -> Tensor:
     """Robust cost (B, N) of every track with weight 1."""
-    square, _ = squared_residuals_at(problem, at)(noise)
+    square, _ = squared_residuals_at(problem, at, known)(noise)
     return robust_loss(square, o.kernel, o.bend)[0]
 
 
-def _near_cost(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
+def _near_cost(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions, known: TrackConstants) -> Tensor:
     """Robust cost (B,) of the near tracks alone."""
-    return torch.where(problem.near, _costs(problem, at, noise, o), 0.0).sum(-1)
+    return torch.where(problem.near, _costs(problem, at, noise, o, known), 0.0).sum(-1)
 
 
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: FitOptions) -> tuple[Tensor, Tensor]:

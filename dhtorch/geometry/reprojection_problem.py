@@ -37,7 +37,7 @@ from dhtorch.geometry.least_squares import (
     solve_spd,
 )
 from dhtorch.geometry.linalg import rotate_planes
-from dhtorch.geometry.se3 import Pose, hat
+from dhtorch.geometry.se3 import Pose
 from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
@@ -133,10 +133,10 @@ def undo_rolling_shutter(
 
 def _straighten(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
     """:func:`undo_rolling_shutter` at z = 1: (u, v, 1) − y · shutter rate × (u, v, 1), divided by its z."""
-    ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
-    ray = ray - y[:, None] * rotate_planes(hat(shutter_rate), ray)
-    z = ray[:, 2:]
-    return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite
+    (u, v), (b0, b1, b2) = seen.unbind(1), shutter_rate[..., None].unbind(1)
+    x = torch.stack((u - y * (b1 - b2 * v), v - y * (b2 * u - b0)), 1)
+    z = (1 - y * (b0 * v - b1 * u))[:, None]
+    return x / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite
 
 
 class TrackConstants(NamedTuple):
@@ -256,12 +256,16 @@ def squared_residuals(
     return _squared_lengths(linear, _noise_factors(linear.fixed, noise))
 
 
-def squared_residuals_at(problem: PoseDepthProblem, at: Unknowns) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+def squared_residuals_at(
+    problem: PoseDepthProblem, at: Unknowns, known: TrackConstants | None = None
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """:func:`squared_residuals` at fixed unknowns as a function of noise (B, N) px², with the tracks in front (B, N).
+
+    ``known`` is :func:`track_constants` of the problem where already computed.
 
     Gradient: as :func:`whitened_residuals`.
     """
-    constants = track_constants(problem)
+    constants = track_constants(problem) if known is None else known
 
     linearised: LinearisedTracks | None = None
 
@@ -348,11 +352,12 @@ def noise_from_medians(
     rounds: int,
     medians: tuple[float, float],
     limits: tuple[float, float],
+    known: TrackConstants | None = None,
 ) -> Tensor:
     """Variance (B, N) px² of a residual coordinate of near and of far tracks, compiled where it can be.
 
     Args:
-        problem, at: as in :func:`linearise_tracks`.
+        problem, at, known: as in :func:`linearise_tracks`.
         reference: the same in torch.
         rounds: of estimates, each from residuals that the one before whitened, the first from unit noise.
         medians: of the size of near and of far residuals under unit noise.
@@ -360,7 +365,7 @@ def noise_from_medians(
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
-    c = track_constants(problem)
+    c = track_constants(problem) if known is None else known
     tensors = problem.ray, problem.inverse, problem.near, *c, problem.far, at.T.R, at.T.t, at.shutter_rate
     return _noise(*tensors, reference=reference, numbers=(rounds, *medians, *limits))
 
@@ -411,9 +416,11 @@ def pose_normal_equations(
 _Fixed = tuple[TrackConstants, tuple[Tensor, Tensor, Tensor], Tensor]
 
 
-def _fixed_tensors(problem: PoseDepthProblem, noise: Tensor, far_weight: Tensor) -> _Fixed:
+def _fixed_tensors(
+    problem: PoseDepthProblem, noise: Tensor, far_weight: Tensor, known: TrackConstants | None = None
+) -> _Fixed:
     """What the cost of tracks contains beside the unknowns."""
-    constants = track_constants(problem)
+    constants = track_constants(problem) if known is None else known
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
     return constants, _noise_factors(constants, noise), share
 
@@ -478,14 +485,16 @@ def minimise_tracks(
     bend: float,
     steps: int,
     rotation_only: bool = False,
+    known: TrackConstants | None = None,
 ) -> tuple[Unknowns, Tensor]:
     """Unknowns after ``steps`` of Levenberg–Marquardt on :func:`pose_normal_equations` from ``at``, and their cost.
 
-    With ``rotation_only`` the translation stays as it is. Arguments otherwise as of :func:`pose_normal_equations`.
+    With ``rotation_only`` the translation stays as it is. ``known`` is as in :func:`linearise_tracks`; arguments
+    otherwise as of :func:`pose_normal_equations`.
 
     Gradient: none. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    fixed = _fixed_tensors(problem, noise, far_weight)
+    fixed = _fixed_tensors(problem, noise, far_weight, known)
 
     def reference() -> tuple[Unknowns, Tensor]:
         normal, cost = pose_normal_equations_at(

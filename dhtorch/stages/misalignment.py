@@ -193,7 +193,7 @@ def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Cam
     uv_0, uv_1 = (torch.where(tracked[..., None], x, torch.zeros_like(x)) for x in (tracks.uv_0, tracks.uv_1))
     if fit.shutter is not None:
         rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
-        height = cam.rays(camera_0, uv_0)[..., 1]
+        height = cam.ray_heights(camera_0, uv_0)
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, height, rate).transpose(1, 2)
     eye = torch.eye(3, dtype=uv_1.dtype, device=uv_1.device)
     T = fit.T_1_from_0

@@ -115,7 +115,7 @@ def two_view(
     )
     y = None
     if fit.shutter is not None:
-        y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
+        y = cam.ray_heights(camera_0, uv_0)
         shutter_rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _safe_pose(fit))
