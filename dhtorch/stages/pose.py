@@ -19,6 +19,7 @@ from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import (
     INITIAL_DAMPING,
     MIN_DEPTH,
+    MIN_PIVOT,
     NormalEquations,
     has_graph,
     implicit_step,
@@ -163,8 +164,48 @@ class _Options:
 
 
 def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Camera, draws: Tensor) -> PoseFit:
-    N, f, c = xyz.shape[1], camera.f, camera.c
     points, usable = _planes(xyz, uv, valid)
+    fit = _near_pose(points, usable, camera.f, camera.c, draws, options=options)
+    return fit.replace(inlier=fit.inlier[:, : xyz.shape[1]])
+
+
+def _is_truncated_only(*_: Tensor, options: _Options) -> bool:
+    """Whether costs are truncated squares without a robust kernel."""
+    return options.kernel is None
+
+
+def _near_pose_kernel(
+    points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, *, options: _Options
+) -> PoseFit:
+    lens = f.contiguous(), c.contiguous()
+    start, valid = _robust_pose_kernel(points, usable, *lens, draws, options=options)
+    B = len(points)
+    R, t, cov, rms, sigma, t_snr = (points.new_empty(B, *size) for size in ((3, 3), (3,), (6, 6), (), (), ()))
+    inlier = torch.empty_like(usable)
+    n_inlier, code = (torch.empty_like(valid, dtype=dtype) for dtype in (torch.int64, torch.int32))
+    torch.ops.dhtorch.pose_last_step.default(
+        *(points, usable, *lens, start.R, start.t, valid),
+        *(R, t, cov, inlier, n_inlier, rms, sigma, t_snr, code),
+        threshold_px=options.threshold_px,
+        min_inlier=options.min_inlier,
+        min_sigma=MIN_NOISE_SIGMA_PX,
+        min_depth=MIN_DEPTH,
+        min_pivot=MIN_PIVOT,
+        max_ratio=ransac.MAX_DISTANCE_RATIO,
+        min_spread=ransac.MIN_SPREAD_RATIO,
+    )
+    estimated = {"cov": cov, "rms_px": rms, "sigma_px": sigma, "t_snr": t_snr}
+    return PoseFit(Pose(R, t), inlier=inlier, n_inlier=n_inlier, code=code, **estimated)
+
+
+@operator(
+    kernel=_near_pose_kernel,
+    dtypes={"points": torch.float32, "usable": torch.bool} | dict.fromkeys(("f", "c", "draws"), torch.float32),
+    any_layout=("f", "c", "draws"),
+    when=_is_truncated_only,
+)
+def _near_pose(points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, *, options: _Options) -> PoseFit:
+    """:func:`pnp_ransac` of planes x, y, z, u, v (B, 5, N'), N' > 0 a multiple of ``PRODUCT_LANES``."""
     with torch.no_grad():
         start, has_start = _robust_pose(points, usable, f, c, draws, options=options)
     start = start.detach()  # forward mode passes through no_grad, into a search that may meet a singular triple
@@ -217,7 +258,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     return PoseFit(
         T_1_from_0=Pose(answer(T.R), answer(T.t)),
         cov=answer(cov),
-        inlier=(inlier & ok[:, None])[:, :N],
+        inlier=inlier & ok[:, None],
         n_inlier=n_inlier,
         rms_px=answer(rms_px),
         sigma_px=answer(sigma_px),
@@ -240,11 +281,6 @@ def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     N = usable.shape[1]
     padding = (0, round_up(N, PRODUCT_LANES) - N)
     return torch.nn.functional.pad(points, padding), torch.nn.functional.pad(usable, padding)
-
-
-def _is_truncated_only(*_: Tensor, options: _Options) -> bool:
-    """Whether costs are truncated squares without a robust kernel."""
-    return options.kernel is None
 
 
 def _robust_pose_kernel(
