@@ -141,7 +141,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c",
             "undo_rolling_shutter(uv_1.transpose(1, 2), camera_0.f, camera_0.c",
         ),
-        ("two_view", "cam.rays(cam.ideal(camera_0), uv_0)[..., 1]", "cam.rays(cam.ideal(camera_0), uv_0)[..., 0]"),
+        ("two_view", "cam.ray_heights(camera_0, uv_0)", "cam.ray_heights(camera_0, uv_0.flip(-1))"),
         ("two_view", "sigma = _root(own + shared, gate", "sigma = _root(own, gate"),
         ("two_view", "max_far_noise * camera_1.f", "max_far_noise * camera_0.f"),
         ("two_view", "fit.sigma_px > max_far_noise", "fit.sigma_px < max_far_noise"),

@@ -65,7 +65,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("unproject", "depth[..., None]", "depth[..., None].abs()"),
         ("rays", "unproject(camera, uv", "unproject(camera, distort(camera, uv)"),
         ("distort", "_to_pixels(camera, _normalised(camera, uv))", "undistort(camera, uv)"),
-        ("undistort", "iterations: int = 12", "iterations: int = 5"),
+        ("undistort", "iterations=iterations", "iterations=5"),
         ("_undistort", "abs().amax(0)", "abs().amin(0)"),
         ("_undistort", "f.amax(-1)", "f.amin(-1)"),
         ("_undistort", "residual * f.amax(-1)[:, None] < ", "residual < "),

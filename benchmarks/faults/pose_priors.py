@@ -51,7 +51,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_is_misaligned", "rejected = rejected | (gain", "rejected = rejected & (gain"),
         ("_is_misaligned", "& (fit.t_snr >= min_t_snr)", ""),
         ("_mean_cost", "(COST_BEND**2 / (COST_BEND**2 + square)) ** 2", "1"),
-        ("_near_parallax", "used = tracked & samples.usable", "used = samples.usable"),
+        ("_parallax", "used = tracked & is_usable", "used = is_usable"),
     ],
     "geometry.pose_conventions": [
         ("TRANSLATION_UNITS", '"millimetres": 1e-3', '"millimetres": 1e3'),

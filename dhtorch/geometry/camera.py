@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 #: Source: OpenCV calibrateCamera, distortion models without thin prism and tilt.
 COEFFICIENTS = (4, 5, 8)
 
+#: Limits the Newton steps of :func:`undistort`, a count. Source: origin not recorded.
+NEWTON_STEPS = 12
+
 #: Limits the distance between a pixel and the distorted image of its ideal pixel, px: converged below, at any focal
 #: length. Source: origin not recorded.
 MAX_RETURN_ERROR_PX = 0.01
@@ -205,7 +208,7 @@ def distort(camera: Camera, uv: Tensor) -> Tensor:
     return _to_pixels(camera, _normalised(camera, uv))
 
 
-def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
+def undistort(camera: Camera, uv: Tensor, *, iterations: int = NEWTON_STEPS) -> Tensor:
     """Ideal pixels (B, N, 2) of pixels of the distorted image.
 
     Newton's method on the distortion model, from the pixel itself. A pixel for which it does not converge (outside

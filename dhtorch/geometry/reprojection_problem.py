@@ -133,7 +133,8 @@ def undo_rolling_shutter(
 
 def _straighten(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
     """:func:`undo_rolling_shutter` at z = 1: (u, v, 1) − y · shutter rate × (u, v, 1), divided by its z."""
-    (u, v), (b0, b1, b2) = seen.unbind(1), shutter_rate[..., None].unbind(1)
+    u, v = seen.unbind(1)
+    b0, b1, b2 = shutter_rate[..., None].unbind(1)
     x = torch.stack((u - y * (b1 - b2 * v), v - y * (b2 * u - b0)), 1)
     z = (1 - y * (b0 * v - b1 * u))[:, None]
     return x / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite

@@ -539,18 +539,51 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     """
     if camera_0.distortion is None and camera_1.distortion is None:
         return tracks
-    is_finite = tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
+    fields = tracks.uv_0, tracks.uv_1, tracks.cov, tracks.valid
+    lenses = (x for camera in (camera_0, camera_1) for x in (camera.f, camera.c, camera.distortion))
+    uv_0, uv_1, cov, valid = _undistort_tracks(*fields, *lenses)
+    return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=valid)
+
+
+def _undistort_tracks_kernel(*tensors: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    no_lens = tensors[0].new_empty(0, 0)
+    inputs = [no_lens if x is None else x.contiguous() for x in tensors]
+    uv_0, uv_1, cov, valid = (torch.empty_like(x) for x in inputs[:4])
+    limits = torch.finfo(uv_0.dtype).eps, cam.MAX_RETURN_ERROR_PX, cam.MIN_DETERMINANT
+    torch.ops.dhtorch.undistort_tracks.default(*inputs, uv_0, uv_1, cov, valid, cam.NEWTON_STEPS, *limits)
+    return uv_0, uv_1, cov, valid
+
+
+#: What the kernel reads: pixels (B, N, 2), covariances (B, N, 2, 2) and validity (B, N), intrinsics of both cameras.
+_TRACK_DTYPES = {
+    name: torch.bool if name == "valid" else torch.float32
+    for name in ("uv_0", "uv_1", "cov", "valid", *(f"{part}_{k}" for k in (0, 1) for part in ("f", "c", "distortion")))
+}
+
+
+def _has_known_lenses(*tensors: Any) -> bool:
+    """Whether both lenses have as many coefficients as a model of :mod:`dhtorch.geometry.camera`."""
+    return all(lens is None or lens.shape[-1] in cam.COEFFICIENTS for lens in (tensors[6], tensors[9]))
+
+
+@operator(
+    kernel=_undistort_tracks_kernel, dtypes=_TRACK_DTYPES, any_layout=tuple(_TRACK_DTYPES), when=_has_known_lenses
+)
+def _undistort_tracks(*tensors: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """:func:`undistort_tracks` of the fields of tracks and the intrinsics of both cameras."""
+    seen_0, seen_1, seen_cov, valid = tensors[:4]
+    camera_0, camera_1 = (Camera(*intrinsics) for intrinsics in (tensors[4:7], tensors[7:]))
+    is_finite = seen_0.isfinite().all(-1) & seen_1.isfinite().all(-1)
     centre_0, centre_1 = (c.c.detach()[:, None] for c in (camera_0, camera_1))
-    uv_0 = cam.undistort(camera_0, torch.where(is_finite[..., None], tracks.uv_0, centre_0))
-    uv_1 = cam.undistort(camera_1, torch.where(is_finite[..., None], tracks.uv_1, centre_1))
+    uv_0 = cam.undistort(camera_0, torch.where(is_finite[..., None], seen_0, centre_0))
+    uv_1 = cam.undistort(camera_1, torch.where(is_finite[..., None], seen_1, centre_1))
     in_model = is_finite & uv_0.isfinite().all(-1) & uv_1.isfinite().all(-1)
-    uv_0 = torch.where(in_model[..., None], uv_0, tracks.uv_0)
-    uv_1 = torch.where(in_model[..., None], uv_1, tracks.uv_1)
+    uv_0 = torch.where(in_model[..., None], uv_0, seen_0)
+    uv_1 = torch.where(in_model[..., None], uv_1, seen_1)
     J = cam.undistort_jacobian(camera_1, torch.where(in_model[..., None], uv_1, centre_1))
-    has_cov = tracks.cov.isfinite()
-    ideal_cov = small_matmul(small_matmul(J, torch.where(has_cov, tracks.cov, 0)), J.mT)
-    cov = torch.where(has_cov, ideal_cov, tracks.cov)
-    return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & in_model)
+    has_cov = seen_cov.isfinite()
+    ideal_cov = small_matmul(small_matmul(J, torch.where(has_cov, seen_cov, 0)), J.mT)
+    return uv_0, uv_1, torch.where(has_cov, ideal_cov, seen_cov), valid & in_model
 
 
 def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:

@@ -188,24 +188,60 @@ def _pose_angle(fit: PoseFit, p: Tensor) -> Tensor:
 
 def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Camera, camera_1: Camera) -> _Parallax:
     """Near returns and the parallax of their tracks under the pose, the fit's rolling shutter undone."""
-    posed = fit.ok[:, None]
-    tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1) & posed
-    uv_0, uv_1 = (torch.where(tracked[..., None], x, torch.zeros_like(x)) for x in (tracks.uv_0, tracks.uv_1))
-    if fit.shutter is not None:
-        rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
+    T, rate = fit.T_1_from_0, None if fit.shutter is None else fit.shutter.shutter_rate
+    seen = tracks.uv_0, tracks.uv_1, tracks.valid
+    return _parallax(*seen, samples.xyz, samples.sigma, fit.ok, T.R, T.t, rate, *_intrinsics(camera_0, camera_1))
+
+
+def _intrinsics(*cameras: Camera) -> tuple[Tensor, ...]:
+    """Focal lengths and principal point (B, 2) px of each camera."""
+    return tuple(x for camera in cameras for x in (camera.f, camera.c))
+
+
+def _parallax_kernel(*tensors: Any) -> _Parallax:
+    sigma, t, rate = tensors[4], tensors[7], tensors[8]
+    inputs = [x.contiguous() for x in (*tensors[:8], t.new_empty(0, 3) if rate is None else rate, *tensors[9:])]
+    p, q, a, variance_rel = (torch.empty_like(inputs[4]) for _ in range(4))
+    uv, used = (torch.empty_like(inputs[k]) for k in (0, 2))
+    noise = sigma.new_empty(len(sigma), 1)
+    near = _Parallax(uv, p, q, a, variance_rel=variance_rel, noise=noise, used=used)
+    torch.ops.dhtorch.near_parallax.default(*inputs, *near, DEPTH_TOLERANCE_REL, MEDIAN_1D, MIN_NOISE_PX)
+    return near
+
+
+#: What the kernel reads: fields of tracks, samples and fit, the shutter rate (B, 3) or None, both cameras' intrinsics.
+_PARALLAX_DTYPES = {
+    name: torch.bool if name in ("valid", "posed") else torch.float32
+    for name in (
+        *("uv_0", "uv_1", "valid", "xyz", "sigma", "posed", "R", "t", "shutter_rate"),
+        *("f_0", "c_0", "f_1", "c_1"),
+    )
+}
+
+
+@operator(kernel=_parallax_kernel, dtypes=_PARALLAX_DTYPES, any_layout=tuple(_PARALLAX_DTYPES))
+def _parallax(*tensors: Any) -> _Parallax:
+    """:func:`_near_parallax` of tensors."""
+    seen_0, seen_1, valid, xyz, sigma, posed, R, t, rate = tensors[:9]
+    camera_0, camera_1 = (Camera(*intrinsics) for intrinsics in (tensors[9:11], tensors[11:]))
+    posed = posed[:, None]
+    tracked = valid & all_finite(seen_0, -1) & all_finite(seen_1, -1) & posed
+    uv_0, uv_1 = (torch.where(tracked[..., None], x, torch.zeros_like(x)) for x in (seen_0, seen_1))
+    if rate is not None:
+        rate = torch.where(posed, rate, torch.zeros_like(rate))
         height = cam.ray_heights(camera_0, uv_0)
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, height, rate).transpose(1, 2)
     eye = torch.eye(3, dtype=uv_1.dtype, device=uv_1.device)
-    T = fit.T_1_from_0
-    T = Pose(torch.where(posed[..., None], T.R, eye), torch.where(posed, T.t, eye[0]))
+    T = Pose(torch.where(posed[..., None], R, eye), torch.where(posed, t, eye[0]))
     geometry = epipolar.triangulate(uv_0, uv_1, camera_0, camera_1, T)
-    z, depth = samples.xyz[..., 2], geometry.depth
+    z, depth = xyz[..., 2], geometry.depth
+    is_usable = all_finite(xyz, -1)
     q = 1 / torch.where(depth.abs() > 1e-6, depth, torch.full_like(depth, 1e-6))
     a = torch.linalg.vector_norm(geometry.slope, dim=-1) * depth * depth
-    used = tracked & samples.usable & (z > 0) & samples.sigma.isfinite() & (a > 0) & a.isfinite()
+    used = tracked & is_usable & (z > 0) & sigma.isfinite() & (a > 0) & a.isfinite()
     p = 1 / torch.where(used, z, torch.ones_like(z))
-    q, a, sigma = (torch.where(used, x, torch.zeros_like(x)) for x in (q, a, samples.sigma))
-    far = tracked & ~samples.usable
+    q, a, sigma = (torch.where(used, x, torch.zeros_like(x)) for x in (q, a, sigma))
+    far = tracked & ~is_usable
     across = [torch.where(m.any(-1, keepdim=True), masked_median(geometry.residual_px, m), 0.0) for m in (used, far)]
     noise = (torch.maximum(*across) / MEDIAN_1D).clamp_min(MIN_NOISE_PX)
     variance_rel = (sigma * p) ** 2 + DEPTH_TOLERANCE_REL**2

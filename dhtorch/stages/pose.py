@@ -194,8 +194,16 @@ def _near_pose_kernel(
         max_ratio=ransac.MAX_DISTANCE_RATIO,
         min_spread=ransac.MIN_SPREAD_RATIO,
     )
-    estimated = {"cov": cov, "rms_px": rms, "sigma_px": sigma, "t_snr": t_snr}
-    return PoseFit(Pose(R, t), inlier=inlier, n_inlier=n_inlier, code=code, **estimated)
+    return PoseFit(
+        T_1_from_0=Pose(R, t),
+        cov=cov,
+        inlier=inlier,
+        n_inlier=n_inlier,
+        rms_px=rms,
+        sigma_px=sigma,
+        t_snr=t_snr,
+        code=code,
+    )
 
 
 @operator(

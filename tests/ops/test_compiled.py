@@ -44,7 +44,7 @@ from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import builder, constants, dispatch, loader
 from dhtorch.pipeline import dense, surface
-from dhtorch.pipeline.pair import merge
+from dhtorch.pipeline.pair import merge, undistort_tracks
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages import misalignment, pose
@@ -935,6 +935,25 @@ def test_pixels_of_a_lens_are_the_same_bits(loaded, monkeypatch, coefficients):
 
 
 @needs_compiler
+@pytest.mark.parametrize("bent", ["both", "first", "second"])
+def test_tracks_in_ideal_pixels_are_the_same_bits(loaded, monkeypatch, bent):
+    _, tracks, camera, _, _ = near_pairs(3, 301, 0.2)
+    lens = torch.tensor([[0.26, -0.95, -0.005, 0.002, 1.1]]).expand(3, 5)
+    cameras = [camera.replace(distortion=lens if bent in ("both", name) else None) for name in ("first", "second")]
+    uv_0, uv_1, cov = 1.8 * tracks.uv_0 - 200, tracks.uv_1.clone(), tracks.cov * (1 + torch.rand(3, 301, 2, 2))
+    uv_0[0, 0], uv_1[1, 3, 1], cov[2, 5, 0, 1], cov[0, 7] = torch.nan, torch.inf, torch.nan, torch.inf
+    seen = tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov)
+    asked = counted(monkeypatch, "undistort_tracks")
+    found, expected = both_ways(lambda: undistort_tracks(seen, *cameras), monkeypatch)
+    assert len(asked) == 1
+    for name in ("uv_0", "uv_1", "cov", "valid"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0, equal_nan=True)
+    assert 0 < int((seen.valid & ~found.valid).sum()) < 300
+    alone = undistort_tracks(seen[1:2], *(x[1:2] for x in cameras))
+    assert torch.equal(alone.cov.nan_to_num(), found.cov[1:2].nan_to_num())
+
+
+@needs_compiler
 def test_triangulated_tracks_agree_up_to_rounding(loaded, monkeypatch):
     _, tracks, camera, _, _ = near_pairs(3, 301, 0.2)
     T = se3.exp(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1)))
@@ -947,6 +966,28 @@ def test_triangulated_tracks_agree_up_to_rounding(loaded, monkeypatch):
         torch.testing.assert_close(a, b, rtol=2e-6, atol=2e-6, msg=lambda text, name=name: f"{name}: {text}")
     leaf = tracks.uv_1.clone().requires_grad_()
     assert epipolar.triangulate(tracks.uv_0, leaf, camera, camera, T).depth.requires_grad
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_parallax_of_near_returns_agrees_up_to_rounding(loaded, monkeypatch, turning):
+    samples, tracks, camera, other, _ = near_pairs(3, 301, 0.2)
+    xyz, uv_1, sigma = samples.xyz.clone(), tracks.uv_1.clone(), samples.sigma.clone()
+    xyz[:, ::3], uv_1[0, 5], xyz[1, 7, 2], sigma[1, 8] = torch.nan, torch.nan, -1.0, torch.inf
+    T = se3.exp(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1)))
+    nothing = torch.full((3, 9, 9), 0.0)
+    fit = pnp_ransac(*near_pairs(3, 301, 0.2)).replace(T_1_from_0=T, code=torch.tensor([0, 0, 2], dtype=torch.int32))
+    rate = 0.05 * torch.randn(3, 3, generator=torch.Generator().manual_seed(2))
+    fit = fit.replace(shutter=Shutter(rate, nothing) if turning else None)
+    inputs = samples.replace(xyz=xyz, sigma=sigma), tracks.replace(uv_1=uv_1), fit
+    asked = counted(monkeypatch, "near_parallax")
+    found, expected = both_ways(
+        lambda: misalignment._near_parallax(*inputs, camera, other.replace(f=1.1 * other.f)), monkeypatch
+    )
+    assert len(asked) == 1
+    assert torch.equal(found.used, expected.used) and expected.used.any(1).tolist() == [True, True, False]
+    for name, a, b in zip(expected._fields, found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6, msg=lambda text, name=name: f"{name}: {text}")
 
 
 @needs_compiler
@@ -963,6 +1004,8 @@ def test_costs_of_depth_profiles_agree_up_to_rounding(loaded, monkeypatch, fitte
     )
     used, scale = uniform(2, 4, 301) < 0.8, 0.5 + uniform(2, 4) if fitted else None
     used[0, 0] = False
+    q[1, :150] = -q[1, :150]  # some fits are not positive
+    used[1, 3, 150:] = False
     asked = counted(monkeypatch, "profile_cost")
     found, expected = both_ways(lambda: misalignment._profile_cost(near, p, used, scale), monkeypatch)
     assert len(asked) == 1 and found[0, 0] == 0

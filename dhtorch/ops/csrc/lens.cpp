@@ -1,12 +1,13 @@
-// Pixels of a distorted image -> ideal pixels, and the Jacobian of this map. References: _undistort and _undistort_jacobian
-// in dhtorch/geometry/camera.py; the same Newton steps in the same order of operations. One thread, no gradient. The
-// dispatch checks dtypes, Python the shapes.
+// Pixels of a distorted image -> ideal pixels, the Jacobian of this map, and tracks in ideal pixels. References: _undistort
+// and _undistort_jacobian in dhtorch/geometry/camera.py, _undistort_tracks in dhtorch/pipeline/pair.py; the same Newton steps
+// in the same order of operations. One thread, no gradient. The dispatch checks dtypes, Python the shapes.
 
 #include "vectors.h"
 
 #include <torch/csrc/stable/library.h>
 
 #include <algorithm>
+#include <cmath>
 
 namespace {
 
@@ -66,72 +67,173 @@ struct Lens {
   }
 };
 
-// LANES pixels, or fewer at the end, as coordinates at z = 1.
-inline void normalise(const float* uv, int64_t count, const float* f, const float* c, Vector& x, Vector& y) {
+// Coordinates of LANES pixels, or fewer at the end, from pairs of numbers.
+inline void split(const float* uv, int64_t count, Vector& u, Vector& v) {
   float across[LANES] = {}, along[LANES] = {};
   for (int64_t i = 0; i < count; ++i) {
     across[i] = uv[2 * i];
     along[i] = uv[2 * i + 1];
   }
-  x = (load(across) - c[0]) / f[0];
-  y = (load(along) - c[1]) / f[1];
+  u = load(across);
+  v = load(along);
 }
+
+inline void join(Vector u, Vector v, int64_t count, float* uv) {
+  for (int64_t i = 0; i < count; ++i) {
+    uv[2 * i] = u[i];
+    uv[2 * i + 1] = v[i];
+  }
+}
+
+// Limits of the Newton steps: their number, the square of a step after which a point stops, and the distance (px) at which
+// it has converged.
+struct Limits {
+  int64_t iterations;
+  float stop, tolerance;
+};
+
+// One camera: focal lengths and principal point (px), and its lens unless `straight`.
+struct Camera {
+  const float *f, *c;
+  bool straight;
+  Lens lens;
+
+  Camera(const Tensor& focal, const Tensor& centre, const Tensor& distortion, int64_t k, double least)
+      : f(data<float>(focal) + 2 * k), c(data<float>(centre) + 2 * k), straight(distortion.size(0) == 0),
+        lens(straight ? nullptr : data<float>(distortion) + distortion.size(1) * k, straight ? 0 : distortion.size(1),
+             static_cast<float>(least)) {}
+
+  // Ideal pixels of u, v; NaN where the steps do not return to the pixel.
+  void undistort(Vector u, Vector v, const Limits& by, Vector& ideal_u, Vector& ideal_v) const {
+    if (straight) {
+      ideal_u = u;
+      ideal_v = v;
+      return;
+    }
+    const Vector none = Vector{}, nan = none + __builtin_nanf(""), to_u = (u - c[0]) / f[0], to_v = (v - c[1]) / f[1];
+    const float longest = std::max(f[0], f[1]);
+    Vector x = to_u, y = to_v, dx, dy, a, b, d;
+    Bits moving = none == 0.0f;
+    for (int64_t step = 0; step < by.iterations && any(moving); ++step) {
+      lens.newton(x, y, to_u, to_v, dx, dy);
+      x = moving ? x + dx : x;
+      y = moving ? y + dy : y;
+      moving = moving & (dx * dx + dy * dy > by.stop);
+    }
+    lens.distort(x, y, u, v, a, b, d);
+    const Bits converged =
+        (magnitude(u - to_u) * longest < by.tolerance) & (magnitude(v - to_v) * longest < by.tolerance);
+    x = converged ? x : none;
+    y = converged ? y : none;
+    lens.newton(x, y, converged ? to_u : none, converged ? to_v : none, dx, dy);
+    ideal_u = converged ? (x + dx) * f[0] + c[0] : nan;
+    ideal_v = converged ? (y + dy) * f[1] + c[1] : nan;
+  }
+
+  // Entries of d(ideal) / d(distorted) at ideal pixels u, v.
+  void jacobian(Vector u, Vector v, Vector (&J)[2][2]) const {
+    Vector away_u, away_v, a = Vector{} + 1.0f, b = Vector{}, d = a;
+    if (!straight) {
+      lens.distort((u - c[0]) / f[0], (v - c[1]) / f[1], away_u, away_v, a, b, d);
+      lens.invert(a, b, d);
+      J[0][0] = f[0] * a / f[0];
+      J[0][1] = f[0] * b / f[1];
+      J[1][0] = f[1] * b / f[0];
+      J[1][1] = f[1] * d / f[1];
+    } else {
+      J[0][0] = a;
+      J[0][1] = J[1][0] = b;
+      J[1][1] = d;
+    }
+  }
+};
 
 // uv (B, N, 2) px, f and c (B, 2) px, distortion (B, k) float32 -> ideal (B, N, 2) px, NaN where the steps, at most
 // `iterations`, do not return to the pixel within `tolerance_px`. A point stops after a step whose square is at most eps.
 void undistort(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor ideal, int64_t iterations, double eps,
                double tolerance_px, double least) {
-  const int64_t B = uv.size(0), N = uv.size(1), count = distortion.size(1);
-  const Vector none = Vector{}, nan = none + __builtin_nanf("");
-  const float stop = static_cast<float>(eps), tolerance = static_cast<float>(tolerance_px);
+  const int64_t B = uv.size(0), N = uv.size(1);
+  const Limits limits = {iterations, static_cast<float>(eps), static_cast<float>(tolerance_px)};
   for (int64_t k = 0; k < B; ++k) {
-    const Lens lens(data<float>(distortion) + count * k, count, static_cast<float>(least));
-    const float *focal = data<float>(f) + 2 * k, *centre = data<float>(c) + 2 * k, longest = std::max(focal[0], focal[1]);
+    const Camera camera(f, c, distortion, k, least);
     for (int64_t n = 0; n < N; n += LANES) {
       const int64_t some = std::min(LANES, N - n);
-      Vector to_u, to_v, dx, dy, u, v, a, b, d;
-      normalise(data<float>(uv) + 2 * (N * k + n), some, focal, centre, to_u, to_v);
-      Vector x = to_u, y = to_v;
-      Bits moving = none == 0.0f;
-      for (int64_t step = 0; step < iterations && any(moving); ++step) {
-        lens.newton(x, y, to_u, to_v, dx, dy);
-        x = moving ? x + dx : x;
-        y = moving ? y + dy : y;
-        moving = moving & (dx * dx + dy * dy > stop);
-      }
-      lens.distort(x, y, u, v, a, b, d);
-      const Bits converged = (magnitude(u - to_u) * longest < tolerance) & (magnitude(v - to_v) * longest < tolerance);
-      x = converged ? x : none;
-      y = converged ? y : none;
-      lens.newton(x, y, converged ? to_u : none, converged ? to_v : none, dx, dy);
-      const Vector found_u = converged ? (x + dx) * focal[0] + centre[0] : nan;
-      const Vector found_v = converged ? (y + dy) * focal[1] + centre[1] : nan;
-      float* to = data<float>(ideal) + 2 * (N * k + n);
-      for (int64_t i = 0; i < some; ++i) {
-        to[2 * i] = found_u[i];
-        to[2 * i + 1] = found_v[i];
-      }
+      Vector u, v;
+      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
+      camera.undistort(u, v, limits, u, v);
+      join(u, v, some, data<float>(ideal) + 2 * (N * k + n));
     }
   }
 }
 
 // Ideal pixels uv (B, N, 2), f and c (B, 2) px, distortion (B, k) float32 -> d(ideal) / d(distorted), J (B, N, 2, 2).
 void undistort_jacobian(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor J, double least) {
-  const int64_t B = uv.size(0), N = uv.size(1), count = distortion.size(1);
+  const int64_t B = uv.size(0), N = uv.size(1);
   for (int64_t k = 0; k < B; ++k) {
-    const Lens lens(data<float>(distortion) + count * k, count, static_cast<float>(least));
-    const float *focal = data<float>(f) + 2 * k, *centre = data<float>(c) + 2 * k;
+    const Camera camera(f, c, distortion, k, least);
     for (int64_t n = 0; n < N; n += LANES) {
       const int64_t some = std::min(LANES, N - n);
-      Vector x, y, u, v, a, b, d;
-      normalise(data<float>(uv) + 2 * (N * k + n), some, focal, centre, x, y);
-      lens.distort(x, y, u, v, a, b, d);
-      lens.invert(a, b, d);
-      const Vector entries[4] = {focal[0] * a / focal[0], focal[0] * b / focal[1], focal[1] * b / focal[0],
-                                 focal[1] * d / focal[1]};
+      Vector u, v, entries[2][2];
+      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
+      camera.jacobian(u, v, entries);
       float* to = data<float>(J) + 4 * (N * k + n);
       for (int64_t i = 0; i < some; ++i) {
-        for (int64_t e = 0; e < 4; ++e) to[4 * i + e] = entries[e][i];
+        for (int64_t e = 0; e < 4; ++e) to[4 * i + e] = entries[e / 2][e % 2][i];
+      }
+    }
+  }
+}
+
+// Covariance cov (2, 2) carried by J, of undistort_tracks in pair.py: entries that are not finite stay as they are.
+void carry(const float J[2][2], const float* cov, float* to) {
+  float C[4], JC[2][2];
+  for (int e = 0; e < 4; ++e) C[e] = std::isfinite(cov[e]) ? cov[e] : 0.0f;
+  for (int i = 0; i < 2; ++i) {
+    for (int j = 0; j < 2; ++j) JC[i][j] = J[i][0] * C[j] + J[i][1] * C[2 + j];
+  }
+  for (int e = 0; e < 4; ++e) {
+    const float moved = JC[e / 2][0] * J[e % 2][0] + JC[e / 2][1] * J[e % 2][1];
+    to[e] = std::isfinite(cov[e]) ? moved : cov[e];
+  }
+}
+
+// Tracks uv_0, uv_1 (B, N, 2) px, cov (B, N, 2, 2) px^2, valid (B, N) bool, and the intrinsics of both cameras, distortion
+// (B, k) or (0, 0), float32. Outputs: the same in ideal pixels; outside of a lens's model unchanged and not valid.
+void undistort_tracks(Tensor uv_0, Tensor uv_1, Tensor cov, Tensor valid, Tensor f_0, Tensor c_0, Tensor distortion_0,
+                      Tensor f_1, Tensor c_1, Tensor distortion_1, Tensor ideal_0, Tensor ideal_1, Tensor ideal_cov,
+                      Tensor in_model, int64_t iterations, double eps, double tolerance_px, double least) {
+  const int64_t B = uv_0.size(0), N = uv_0.size(1);
+  const Limits limits = {iterations, static_cast<float>(eps), static_cast<float>(tolerance_px)};
+  const Vector none = Vector{};
+  for (int64_t k = 0; k < B; ++k) {
+    const Camera cameras[2] = {{f_0, c_0, distortion_0, k, least}, {f_1, c_1, distortion_1, k, least}};
+    for (int64_t n = 0; n < N; n += LANES) {
+      const int64_t some = std::min(LANES, N - n), at = N * k + n;
+      const Tensor *from[2] = {&uv_0, &uv_1}, *to[2] = {&ideal_0, &ideal_1};
+      Vector seen[2][2], ideal[2][2], J[2][2];
+      Bits sound = none == 0.0f;
+      for (int view = 0; view < 2; ++view) {
+        split(data<float>(*from[view]) + 2 * at, some, seen[view][0], seen[view][1]);
+        for (const Vector& x : seen[view]) sound = sound & (x - x == 0.0f);
+      }
+      for (int view = 0; view < 2; ++view) {
+        const Camera& camera = cameras[view];
+        Vector start[2];
+        for (int i = 0; i < 2; ++i) start[i] = sound ? seen[view][i] : none + camera.c[i];
+        camera.undistort(start[0], start[1], limits, ideal[view][0], ideal[view][1]);
+      }
+      for (const auto& view : ideal) {
+        for (const Vector& x : view) sound = sound & (x - x == 0.0f);
+      }
+      for (int view = 0; view < 2; ++view) {
+        for (int i = 0; i < 2; ++i) ideal[view][i] = sound ? ideal[view][i] : seen[view][i];
+        join(ideal[view][0], ideal[view][1], some, data<float>(*to[view]) + 2 * at);
+      }
+      cameras[1].jacobian(sound ? ideal[1][0] : none + cameras[1].c[0], sound ? ideal[1][1] : none + cameras[1].c[1], J);
+      for (int64_t i = 0; i < some; ++i) {
+        const float entries[2][2] = {{J[0][0][i], J[0][1][i]}, {J[1][0][i], J[1][1][i]}};
+        carry(entries, data<float>(cov) + 4 * (at + i), data<float>(ideal_cov) + 4 * (at + i));
+        data<bool>(in_model)[at + i] = data<bool>(valid)[at + i] && sound[i] != 0;
       }
     }
   }
@@ -143,10 +245,15 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
       "undistort(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor(a!) ideal, int iterations, float eps, "
       "float tolerance_px, float least) -> ()");
+  m.def(
+      "undistort_tracks(Tensor uv_0, Tensor uv_1, Tensor cov, Tensor valid, Tensor f_0, Tensor c_0, Tensor distortion_0, "
+      "Tensor f_1, Tensor c_1, Tensor distortion_1, Tensor(a!) ideal_0, Tensor(b!) ideal_1, Tensor(c!) ideal_cov, "
+      "Tensor(d!) in_model, int iterations, float eps, float tolerance_px, float least) -> ()");
   m.def("undistort_jacobian(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor(a!) J, float least) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("undistort", TORCH_BOX(&undistort));
+  m.impl("undistort_tracks", TORCH_BOX(&undistort_tracks));
   m.impl("undistort_jacobian", TORCH_BOX(&undistort_jacobian));
 }
