@@ -40,8 +40,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "ops.csrc.pose": [
         ("outer_root", "return -third - std::copysign(s * size, q);", "return -third + std::copysign(s * size, q);"),
         ("ranges", "d[i][k + 2] = pp * v[i] - s * p[i];", "d[i][k + 2] = pp * v[i] + s * p[i];"),
-        ("polish", "d[k] -= step[k]", "d[k] += step[k]"),
-        ("axes", "cross(normal, first, third);", "cross(first, normal, third);"),
+        ("polish", "y[k] = next - d[k] * m[k];", "y[k] = next + d[k] * m[k];"),
+        ("axes", "found[2][i] = third[i];", "found[2][i] = second[i];"),
         ("p3p", "t -= R * X[0][c];", "t += R * X[0][c];"),
         ("take", "from[4 * N + of[k]] - c[1]) / fy", "from[4 * N + of[k]] - c[1]) / fx"),
     ],
