@@ -50,7 +50,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("names", "sorted(pairs.items())", "reversed(pairs.items())"),
     ],
     "pytree": [
-        ("chunked_apply", "count <= size", "count < size - 1"),
+        ("chunked_apply", "range(0, count, size)", "range(0, count - 1, size)"),
         ("chunked_apply", "x[i : i + size]", "x[:size]"),
         ("collate", "torch.cat(xs, dim)", "torch.cat(xs[::-1], dim)"),
         ("_join", "(v is None) != (first is None)", "False"),

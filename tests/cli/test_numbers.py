@@ -489,6 +489,7 @@ def test_the_verdict_of_an_episode_is_that_of_most_known_pictures():
     zero = [0.0] * 5
     assert episode([moved, moved, still, still, still], zero).verdict == still
     assert episode([moved, moved, moved, still, unknown], zero).verdict == moved
+    assert episode([moved, moved, still, unknown, unknown], zero).verdict == moved, "two fifths unknown are no half"
     assert episode([moved, moved, unknown, unknown, unknown], zero).verdict == unknown
     assert episode([still] * 5, zero, changes=[3]).verdict == moved
 

@@ -29,6 +29,15 @@ def test_answers_that_do_not_count_change_nothing_and_get_no_gradient():
         assert x.grad.isfinite().all() and (x.grad[:, 40:] == 0).all() and (x.grad[:, :40] != 0).all()
 
 
+def test_an_error_above_1_counts_as_1_and_has_no_gradient():
+    confidence, error = answers()
+    error = (3 * error).requires_grad_()
+    loss = risk_coverage_loss(confidence, error)
+    torch.testing.assert_close(loss, risk_coverage_loss(confidence, error.clamp(max=1)))
+    loss.sum().backward()
+    assert torch.equal(error.grad > 0, error < 1)
+
+
 def test_no_answers_cost_nothing():
     confidence, error = answers()
     loss = risk_coverage_loss(confidence.requires_grad_(), error, torch.zeros(3, 60, dtype=torch.bool))
