@@ -32,6 +32,8 @@ def test_slopes_are_found_with_the_scatter_between_groups():
     slope, sigma = grouped_slopes(np.stack((x, group / 29), 1), y, np.full(300, 0.01), group, 0.0)
     assert abs(slope[0] - 0.3) < 3 * sigma[0] and abs(slope[1]) < 3 * sigma[1]
     assert sigma[1] > 2 * 0.014 / 300**0.5  # errors common to a group do not average out over its members
+    moved = grouped_slopes(np.stack((x + 5, group / 29 - 2), 1), y + 1, np.full(300, 0.01), group, 0.0)
+    np.testing.assert_allclose(moved, (slope, sigma), rtol=1e-9, atol=1e-12, err_msg="an intercept is fitted")
 
 
 def test_a_similarity_of_camera_paths():

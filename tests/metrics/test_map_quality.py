@@ -27,6 +27,7 @@ def test_each_artefact_is_counted_and_returns_are_none():
     source[20:22, 30:34] = Source.NONE  # a pinhole of 8 px
     source[20, 65] = Source.NONE  # one of 1 px amid returns
     source[55:57, 70:72] = Source.SENSOR  # no answer of the sweep
+    source[58, 5:45] = Source.SENSOR  # nor is a line of returns
     found = map_quality.find_artefacts(flat_map(source))
     assert [int(part.sum()) for part in found] == [12, 15, 9]
     assert found.speck[0, 2:5, 2:6].all() and found.line[0, 30, 5:20].all() and found.pinhole[0, 20, 65]
