@@ -106,6 +106,7 @@ def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
         key = sparse_grid.pack_cells((xyz / 0.8).floor().long())
         assert torch.isin(key, volume.key).all(), along
     assert len(volume.key) < 80 and torch.equal(volume.key, volume.key.sort().values)
+    assert make_volume(0.1).truncation == pytest.approx(0.4), "four voxels"
 
 
 def scattered(seed=0):
