@@ -41,6 +41,34 @@ def test_observations_that_the_poses_contradict_are_left_out(pair, tmp_path: Pat
     assert 0 < wrong.n_points < right.n_points, "the sensor's depth stays, in the picture whose depth it is"
 
 
+def test_the_error_of_a_point_is_the_mean_of_its_distances(pair, tmp_path: Path) -> None:
+    room, answers = pair
+    counts = write_colmap_workspace(tmp_path, room, answers, poses_of(room))
+
+    def lines(name):
+        text = (tmp_path / "sparse" / "0" / name).read_text()
+        return [line.split() for line in text.splitlines() if not line.startswith("#")]
+
+    images = lines("images.txt")
+    seen = {
+        head[0]: np.array(uv, float).reshape(-1, 3)[:, :2] for head, uv in zip(images[::2], images[1::2], strict=True)
+    }
+    frame = {head[0]: int(Path(head[-1]).stem) for head in images[::2]}
+    poses, camera, n = poses_of(room), room[0].camera.to(torch.float64), 0
+    for row in lines("points3D.txt"):
+        xyz, error, track = torch.tensor([float(x) for x in row[1:4]]).double(), float(row[7]), row[8:]
+        if len(track) < 4:
+            continue
+        n += 1
+        misses = []
+        for name, index in zip(track[::2], track[1::2], strict=True):
+            inside = se3.apply(se3.invert(poses[frame[name]]), xyz[None, None])
+            at = cameras.project(camera, inside)[0, 0] + 0.5
+            misses.append(float((at - torch.from_numpy(seen[name][int(index)])).norm()))
+        assert error == pytest.approx(np.mean(misses), abs=2e-3)
+    assert n == counts.n_triangulated
+
+
 def test_the_pictures_are_the_frames(pair, tmp_path: Path) -> None:
     room, answers = pair
     write_colmap_workspace(tmp_path, room, answers, poses_of(room))

@@ -13,6 +13,7 @@ from dhtorch.integrate.level import (
     _MIN_GUESS_COSINE,
     _fit_floor_normal,
     _fit_upright_direction,
+    _is_in_own_world,
     _spiral_directions,
     estimate_up,
 )
@@ -61,6 +62,9 @@ def test_walls_tell_where_no_floor_is_seen():
     assert found is not None and float(found @ torch.tensor([0.0, -1, 0]).double()) > 0.9986, "3°"
     assert _fit_upright_direction(clutter, guess / guess.norm()) is None, "what stands anyhow tells nothing"
     assert _fit_upright_direction(normal[:50], guess / guess.norm()) is None
+    steps = torch.tensor([0.0, -1, 0]).double() + 0.03 * torch.randn(1500, 3, dtype=torch.float64, generator=draw)
+    found = _fit_upright_direction(torch.cat((steps, clutter)), guess / guess.norm())
+    assert found is not None and float(found @ torch.tensor([0.0, -1, 0]).double()) > 0.9986, "what is level alone"
 
 
 def held(kind: str, rotation: tuple[float, float, float], chained: bool = False) -> list[float]:
@@ -90,9 +94,18 @@ def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():
     )
 
 
+def test_a_map_is_in_the_recordings_world_if_a_frame_of_it_is_there():
+    R = se3.exp(torch.tensor([[0.1 * k, 0.0, 0.0, 0.0, 0.0, 0.0] for k in range(4)], dtype=torch.float64)).R
+    poses = Pose(R[1:], torch.zeros(3, 3).double())
+    recording = Recording("a", "tum", load=lambda _i: None, number=torch.arange(3), poses=poses)  # type: ignore[arg-type]
+    assert _is_in_own_world(recording, [poses[2:3]]) and not _is_in_own_world(recording, [])
+    assert not _is_in_own_world(recording, [Pose(R[:1], poses.t[:1])])
+
+
 def test_directions_are_spread_evenly():
     found = _spiral_directions(2000)
     torch.testing.assert_close(found.norm(dim=-1), torch.ones(2000, dtype=torch.float64))
     torch.testing.assert_close(found.T @ found / 2000, torch.eye(3).double() / 3, atol=2e-3, rtol=0)
+    assert found.mean(0).norm() < 2e-3
     nearest = (found @ found.T).fill_diagonal_(-1).amax(1).clamp(-1, 1).acos()
     assert nearest.max() < 1.6 * nearest.median()

@@ -18,6 +18,7 @@ from dhtorch.cli.run import config_dir, main
 from dhtorch.experiments import report
 from dhtorch.integrate import mapping
 from dhtorch.pipeline.presets import METHODS
+from dhtorch.records import Camera, Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz.viewer import points
@@ -283,6 +284,12 @@ def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
         side *= 1 if frame.depth_camera is not None else depth.shape[1] / max(frame.hw[1], 1)
         sizes.append(float(np.median(depth[np.isfinite(depth) & (depth > 0)])) / side)
     assert voxel == pytest.approx(max(0.005, 2 * sorted(sizes)[1]), rel=0.06), "two digits"
+
+
+def test_pixels_of_a_map_without_a_camera_of_its_own_are_those_of_the_picture_at_its_size():
+    camera = Camera(torch.full((1, 2), 50.0), torch.full((1, 2), 20.0))
+    frame = Frame(torch.zeros(1, 3, 48, 64), torch.full((1, 24, 32), 2.0), camera)
+    assert mapping.choose_voxel([frame]) == pytest.approx(2 * 2.0 / 25)
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ NEAR = 2.2
 
 def test_unsure_depth_gets_voxels_of_its_own_and_sure_depth_the_sensors():
     assert choose_coarse_voxel(0.01, torch.tensor([0.12, 0.16, 0.2, torch.nan, 0.0])) == pytest.approx(0.04)
-    assert choose_coarse_voxel(0.01, torch.full((9,), 0.02)) is None
+    assert choose_coarse_voxel(0.01, torch.full((9,), 0.064)) == pytest.approx(0.016)
+    assert choose_coarse_voxel(0.01, torch.full((9,), 0.056)) is None, "1.4 voxels"
     assert choose_coarse_voxel(0.01, torch.zeros(0)) is None
 
 
