@@ -26,12 +26,15 @@ OFFSETS = torch.tensor(
     dtype=torch.float64,
 )
 
+#: Offset of one more picture: ahead, where no rotation is like it.
+AHEAD = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.04], dtype=torch.float64)
+
 
 @cache
 def room(light="day"):
     here = hand_held_path("static", 1, step_m=0.0, rate_hz=30.0, seed=3)
-    poses = collate(se3.compose(here, se3.exp(xi[None])) for xi in OFFSETS)
-    return LitRoom(light=light, seed=3, n_frames=len(OFFSETS), hw=(120, 160), supersample=2, true_poses=poses)
+    poses = collate(se3.compose(here, se3.exp(xi[None])) for xi in (*OFFSETS, AHEAD))
+    return LitRoom(light=light, seed=3, n_frames=len(OFFSETS) + 1, hw=(120, 160), supersample=2, true_poses=poses)
 
 
 @cache
@@ -108,6 +111,9 @@ def test_without_depth_the_rotation_is_known_and_the_translation_up_to_scale():
     length = float(moved.T_ref_from_live.t.norm())
     assert length == pytest.approx(1.0) or length == 0
     assert "no length" in describe_pin(still)
+    ahead = pin.check(room()[4].image)
+    assert bool(ahead.moved) and float(ahead.distance) < 1, "the best rotation is none"
+    assert float(ahead.T_ref_from_live.t[0, 2]) == pytest.approx(1, abs=0.02)
 
 
 def test_a_capture_as_reference_leaves_out_what_moves():
@@ -128,6 +134,12 @@ def test_given_intrinsics_replace_the_references():
     zoomed = K.clone()
     zoomed[:, :2, :2] *= 1.05
     assert not torch.allclose(pinned().check(room()[1].image, zoomed).offset, found().offset[1:2], atol=1e-3)
+
+
+def test_a_picture_of_another_size_has_the_references_camera_at_its_size():
+    camera = pinned()._live_camera(None, 2, (60, 80))
+    torch.testing.assert_close(camera.f, room()[0].camera.f.expand(2, 2) / 2)
+    torch.testing.assert_close(camera.c, (room()[0].camera.c.expand(2, 2) + 0.5) / 2 - 0.5)
 
 
 def test_bad_arguments_are_named():

@@ -1,12 +1,16 @@
 """The metric size of a model: right within its sigma, placed in the capture's world, refused where it is bent."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from dhtorch.measure import ModelView, SceneModel, metric_scale
-from dhtorch.measure.local_scales import LocalScales, ScaleTolerance, estimate_scale, find_faults
+from dhtorch.codes import Flag
+from dhtorch.measure import ModelView, SceneModel, metric_scale, scale
+from dhtorch.measure.local_scales import REGIONS, LocalScales, ScaleTolerance, estimate_scale, find_faults, local_scales
+from dhtorch.stages.sample import regular_grid
 from tests.support import room_models as made
 
 
@@ -97,6 +101,29 @@ def test_a_view_of_another_aspect_ratio_is_compared_by_rays():
     assert abs(measure(SceneModel(cut)).scale / true - 1) < 0.01
 
 
+def test_places_of_a_picture_are_those_compared():
+    view, frame = made.room_model("maps")[0].views[0], made.room_scene().frames[0]
+    pairs = scale._measure(SceneModel([view]), view, frame, True, made.NEAR)
+    uv = torch.from_numpy(pairs.share) * torch.tensor(view.hw[::-1]) - 0.5
+    grid = regular_grid(view.hw, scale._PLACES, dtype=torch.float64)
+    assert torch.cdist(uv, grid).amin(1).max() < 1e-4
+    at = scale._same_pixels(SimpleNamespace(hw=(48, 64)), frame, torch.tensor([[10.0, 20.0]]).double())
+    torch.testing.assert_close(at, torch.tensor([[[20.5, 40.5]]]).double())
+    samples = SimpleNamespace(
+        usable=torch.tensor([[True, True, False]]), flag=torch.tensor([[Flag.LOW_CONF, Flag.DEPTH_EDGE, 0]])
+    )
+    assert scale._is_clean(samples).tolist() == [True, False, False]
+
+
+def test_local_scales_are_those_of_regions_row_by_row():
+    row, column = np.divmod(np.repeat(np.arange(12), 7), 4)
+    share = np.stack(((column + 0.5) / REGIONS[1], (row + 0.5) / REGIONS[0]), 1)
+    depth = 2 + 0.1 * (4 * row + column)
+    local = local_scales(np.zeros(84, int), share, depth, np.ones(84), np.zeros((84, 3)))
+    assert local.region.tolist() == list(range(12))
+    np.testing.assert_allclose(local.log, np.log(2 + 0.1 * np.arange(12)))
+
+
 def synthetic(change=0.0, seed=0, F=24, noise=0.01):
     draw = np.random.default_rng(seed)
     frame, region = np.repeat(np.arange(F), 12), np.tile(np.arange(12), F)
@@ -115,3 +142,13 @@ def test_sigma_and_refusals_of_drawn_local_scales():
     assert np.mean([bool(find_faults(local, names)[0]) for local in drawn]) <= 0.02
     assert all(find_faults(synthetic(0.03, seed), names)[0] for seed in range(20))
     assert not find_faults(synthetic(0.03), names, ScaleTolerance(change=0.06))[0]
+    np.testing.assert_allclose(estimate_scale(synthetic(noise=0.02), 24)[3], 0.02 / 12**0.5)
+
+
+def test_faults_are_ordered_by_their_excess():
+    faults, _ = find_faults(synthetic(0.1), [str(k) for k in range(24)])
+    of = ScaleTolerance()
+    parts = [f.kind in ("frames", "region") or f.where.startswith("around") for f in faults]
+    limit = np.where(parts, of.scan_deviations, of.deviations)
+    excess = np.array([(abs(np.log1p(f.change)) - of.change) / f.sigma for f in faults]) - limit
+    assert len(faults) > 3 and (np.diff(excess) <= 0).all() and (excess > 0).all()
