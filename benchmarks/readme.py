@@ -16,7 +16,7 @@ import re
 import statistics
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +51,16 @@ DEFAULT_ROOM = "synthetic_walk_2"
 COMPARED = ("map", "auto_2", "auto")
 
 
+@cache
+def read_json(path: Path) -> Any:
+    """Content of a result file, which nobody changes: many tables are of the same files."""
+    return json.loads(path.read_text())
+
+
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
     """Scene → method → row of a result file, for one truth test."""
     by_scene: dict[str, dict[str, dict[str, Any]]] = {}
-    for row in json.loads((RESULTS / f"{name}.json").read_text())["rows"]:
+    for row in read_json(RESULTS / f"{name}.json")["rows"]:
         if row["pair"] is None and row["truth"] == truth:
             by_scene.setdefault(row["scene"], {})[row["method"]] = row
     return by_scene
@@ -107,7 +113,7 @@ def twin() -> str:
         cells += [" / ".join(percent(row[key]) for row in both) for key in ("coverage", "median_rel")]
         of_paper, of_kornia = (sum(row["ms"].values()) for row in both)
         rows.append([*cells, number(of_kornia / of_paper)])
-    summary = json.loads((RESULTS / "kornia_twin.json").read_text())["summary"]
+    summary = read_json(RESULTS / "kornia_twin.json")["summary"]
     ratios = [number(summary[f"kornia.{k}_ratio_to_paper"]["value"]) for k in ("coverage", "error")]
     rows.append(["`kornia` / `paper`, geometric mean", "", *ratios, ""])
     return table(["scene", "candidates", "coverage, `paper` / `kornia`", "median error", "time, ratio"], rows)
@@ -120,7 +126,7 @@ def chained() -> str:
     for scene, methods in scenes("track_chain", "full").items():
         pairs = [f"{percent(methods[m]['coverage'])}, {percent(methods[m]['median_rel'])}" for m in names]
         rows.append([scene, str(methods["paper"]["n_candidates"]), *pairs])
-    summary = json.loads((RESULTS / "track_chain.json").read_text())["summary"]
+    summary = read_json(RESULTS / "track_chain.json")["summary"]
     medians = [[summary[f"{m}.{key}"]["value"] for key in ("coverage", "median_rel", "p90_rel")] for m in names]
     rows.append(["median over scenes", "", *(f"{percent(c)}, {percent(e)}" for c, e, _ in medians)])
     rows.append(["90th percentile of the error, median", "", *(percent(p) for _, _, p in medians)])
@@ -135,7 +141,7 @@ def chained() -> str:
 
 def truths() -> str:
     """What the truth test changes: medians over scenes."""
-    summary = json.loads((RESULTS / "shared_scenes.json").read_text())["summary"]
+    summary = read_json(RESULTS / "shared_scenes.json")["summary"]
     rows = []
     for truth in ("raw", "5x5", "full"):
         prefix = {m: f"{m}." if truth == "full" else f"{m}.{truth}." for m in ("paper", "opencv")}
@@ -148,7 +154,7 @@ def truths() -> str:
 
 def comparison() -> str:
     """The numbers that decide the method comparison, each beside its bar."""
-    summary = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
+    summary = read_json(RESULTS / "method_comparison.json")["summary"]
     rows = []
     for name, (one, many, _) in method_comparison.METHOD_BARS.items():
         bars = f"{BOUND[name]} {one:g}" if one == many else f"{BOUND[name]} {one:g} / {many:g}"
@@ -159,7 +165,7 @@ def comparison() -> str:
 
 def chosen_views(*results: str) -> str:
     """``auto`` and that of the second release in each of some comparisons, beside its bars."""
-    summaries = [json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in results]
+    summaries = [read_json(RESULTS / f"{name}.json")["summary"] for name in results]
     rows = []
     for name, (words, bar) in GAINS.items():
         cells = ["" if (e := s.get(f"auto.{name}")) is None else f"{e['value']:.3f}" for s in summaries]
@@ -172,9 +178,9 @@ def chosen_views(*results: str) -> str:
 def beside_chosen() -> str:
     """View selection beside every fixed gap: coverage, false answers, cost."""
     study, stress = (
-        json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in ("views_study", "stress")
+        read_json(RESULTS / f"{name}.json")["summary"] for name in ("views_study", "stress")
     )
-    timed = {r["name"]: r["ratio"] for r in json.loads((RESULTS / "stream.json").read_text()) if r["threads"] == 1}
+    timed = {r["name"]: r["ratio"] for r in read_json(RESULTS / "stream.json") if r["threads"] == 1}
     worst, turned, wrong = (s[f"auto.{n}"]["value"] for s, n in zip((study, study, stress), BESIDE, strict=True))
     rows = [
         ["coverage at 5 % risk over that of the best fixed gap, worst scene", number(worst), "≥ 0.9"],
@@ -192,8 +198,8 @@ BESIDE = ("fixed_gap_ratio_worst", "rotation_answered", "convoy_wrong")
 
 def every_pixel(*results: str) -> str:
     """The numbers that decide the dense comparison, in each of some results, beside their bars; and what it costs."""
-    summaries = [json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in results]
-    timed = [r for r in json.loads((RESULTS / "dense_speed.json").read_text()) if r["threads"] == 1]
+    summaries = [read_json(RESULTS / f"{name}.json")["summary"] for name in results]
+    timed = [r for r in read_json(RESULTS / "dense_speed.json") if r["threads"] == 1]
     rows = []
     for name, (words, bar) in PIXELS.items():
         values = [s.get(name, {}).get("value") for s in summaries]
@@ -243,7 +249,7 @@ def by_scene(comparison: str) -> str:
 
 def archived_answers() -> dict[str, dict[str, Any]]:
     """Result files with a verdict: name → result."""
-    results = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
+    results = {path.stem: read_json(path) for path in sorted(RESULTS.glob("*.json"))}
     return {name: result for name, result in results.items() if isinstance(result, dict) and result.get("verdict")}
 
 
@@ -286,7 +292,7 @@ CLOSED_LOOP = {
 
 def closed_loop() -> str:
     """Success rates of the policies in simulation."""
-    (result,) = json.loads((RESULTS / "closed_loop.json").read_text())
+    (result,) = read_json(RESULTS / "closed_loop.json")
     rows = []
     for name, words in CLOSED_LOOP.items():
         rate = result["rates"][name]
@@ -300,7 +306,7 @@ def closed_loop() -> str:
 
 def closed_loop_differences() -> str:
     """Paired differences of the success rates, in points, over the test episodes."""
-    (result,) = json.loads((RESULTS / "closed_loop.json").read_text())
+    (result,) = read_json(RESULTS / "closed_loop.json")
     rows = [
         [f"`{name}`", *(f"{100 * e[key]:+.0f}" for key in ("value", "low", "high"))]
         for name, e in result["differences"].items()
@@ -315,8 +321,8 @@ def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
 
 def how_good() -> str:
     """Coverage, errors and time of the methods on the shared scenes."""
-    sparse = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
-    pixels = json.loads((RESULTS / "dense.json").read_text())["summary"]
+    sparse = read_json(RESULTS / "method_comparison.json")["summary"]
+    pixels = read_json(RESULTS / "dense.json")["summary"]
     rows = []
     for key, words in GOOD.items():
         cells = [percent(sparse.get(f"{m}.{key}", {}).get("value")) for m in README_METHODS]
@@ -332,7 +338,7 @@ def how_good() -> str:
 
 def untouched() -> str:
     """README's one table: coverage and errors on scenes that no constant was chosen on, beside peers."""
-    samples, maps = (json.loads((RESULTS / f"{name}.json").read_text()) for name in ("untouched", "untouched_dense"))
+    samples, maps = (read_json(RESULTS / f"{name}.json") for name in ("untouched", "untouched_dense"))
     scenes = {row["scene"] for row in samples["rows"]}  # the other file has stress rooms as well
     maps["rows"] = [row for row in maps["rows"] if row["scene"] in scenes]
     columns = [(samples, m, f"`{m}`") for m in UNTOUCHED_METHODS]
@@ -417,7 +423,7 @@ def loader_times() -> str:
 
 def swept() -> str:
     """The jobs of the sweep that README shows, a row each; the best of a column in bold."""
-    jobs = json.loads((RESULTS / "sweep.json").read_text())
+    jobs = read_json(RESULTS / "sweep.json")
     shown = [[number_as(job[key], key) for key in SWEPT] for job in jobs]
     for k, (key, better) in enumerate(SWEPT.items()):
         if better:
@@ -461,7 +467,7 @@ def enriched() -> str:
     file = RESULTS / "enrich.json"
     if not file.is_file():
         return "Not measured yet: `benchmarks/results/enrich.json` is not there."
-    others = [each for each in json.loads((RESULTS / "clients.json").read_text()) if each["opened"]]
+    others = [each for each in read_json(RESULTS / "clients.json") if each["opened"]]
     rows = []
     for record in sorted(json.loads(file.read_text()), key=lambda record: (record["source"], record["data"])):
         name = f"`{record['data']}`" if record["origin"] == "real" else "written"
@@ -529,7 +535,7 @@ VALIDATIONS = (
 
 def validated() -> str:
     """What validation finds, beside a fixed-threshold photometric check and the bars."""
-    results = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in VALIDATIONS}
+    results = {name: read_json(RESULTS / f"{name}.json") for name, _, _ in VALIDATIONS}
     summary = {name: result["summary"] for name, result in results.items()}
     rows = []
     for name, (words, bar) in SCALE_ROWS.items():
@@ -558,7 +564,7 @@ def named_registration(rows: list[dict[str, Any]]) -> str:
 def validated_real() -> str:
     """Validation of real sensors' own depth."""
     rows = []
-    for row in json.loads((RESULTS / "validate_real.json").read_text()):
+    for row in read_json(RESULTS / "validate_real.json"):
         whole, limited = row["whole"], row["whole"]["limited"]
         wrong = "unknown" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
@@ -599,7 +605,7 @@ PINNED = {
 
 def pinned() -> str:
     """What a pinned camera reaches, beside its bars."""
-    summary = json.loads((RESULTS / "pin_study.json").read_text())["summary"]
+    summary = read_json(RESULTS / "pin_study.json")["summary"]
     rows = [[words, f"{summary[f'pin.{name}']['value']:.3f}", bar] for name, (words, bar) in PINNED.items()]
     return table(["number", "`pin_study`", "bar"], rows)
 
@@ -616,7 +622,7 @@ ALIGNED = {
 
 def aligned(*results: str) -> str:
     """What alignment reaches, of several results, beside its bars."""
-    results = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
+    results = [read_json(RESULTS / f"{name}.json") for name in results]
     rows = [
         [words, *(f"{result['summary'][f'align.{name}']['value']:.3f}" for result in results), bar]
         for name, (words, bar) in ALIGNED.items()
@@ -653,7 +659,7 @@ SCALED = {
 
 def scaled() -> str:
     """What the scale of a model reaches, beside its bars."""
-    result = json.loads((RESULTS / "scale_study.json").read_text())["summary"]
+    result = read_json(RESULTS / "scale_study.json")["summary"]
     rows = [[words, f"{result[f'scale.{name}']['value']:.3f}", bar] for name, (words, bar) in SCALED.items()]
     return table(["number", "measured", "bar"], rows)
 
@@ -665,7 +671,7 @@ def questions() -> str:
 
 def caught() -> str:
     """Planted faults that a test of their module caught, of those that change an answer."""
-    counts = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()), packages=True)
+    counts = mutants.by_module(read_json(RESULTS / "mutants.json"), packages=True)
     cells = [
         [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in counts
     ]
@@ -692,7 +698,7 @@ def lerobot_trained() -> str:
 
 def faults_of_captures() -> str:
     """Planted faults of captures: outcomes by fault, over windows and layouts."""
-    rows = [row for row in json.loads((RESULTS / "capture_faults.json").read_text()) if row["counted"]]
+    rows = [row for row in read_json(RESULTS / "capture_faults.json") if row["counted"]]
     cells = []
     for fault in dict.fromkeys(row["fault"] for row in rows):
         outcomes = [row["outcome"] for row in rows if row["fault"] == fault]
@@ -719,7 +725,7 @@ def faults_of_captures() -> str:
 
 def sensitivities() -> str:
     """Options whose half or twice value changes coverage or median error most, and those that change neither."""
-    rows = json.loads((RESULTS / "sensitivity.json").read_text())
+    rows = read_json(RESULTS / "sensitivity.json")
     numbers = ("coverage", "median_rel")
     cells = []
     for row in rows:

@@ -41,22 +41,26 @@ def packed(statement):
     return isinstance(statement.targets[0], ast.Tuple) and len(work) > 1 and len({shape(v) for v in work}) > 1
 
 
-@pytest.mark.parametrize("file", FILES)
-def test_a_tuple_assigns_like_things(file):
+def nodes():
+    """Every node of every file that is checked, with where it stands."""
+    for file in FILES:
+        for node in ast.walk(ast.parse((ROOT / file).read_text())):
+            yield f"{file}, line {getattr(node, 'lineno', 0)}", node
+
+
+def test_a_tuple_assigns_like_things():
     """``a, b = f(x), f(y)`` reads at once; ``a, b = f(x), g(y, z)`` is two statements in one line."""
-    tree = ast.parse((ROOT / file).read_text())
-    found = [f"line {node.lineno}: {ast.unparse(node)}" for node in ast.walk(tree) if packed(node)]
+    found = [f"{place}: {ast.unparse(node)}" for place, node in nodes() if packed(node)]
     assert not found, "one statement a line:\n" + "\n".join(found)
 
 
-@pytest.mark.parametrize("file", FILES)
-def test_calls_name_what_they_pass(file):
+def test_calls_name_what_they_pass():
     found = []
-    for node in ast.walk(ast.parse((ROOT / file).read_text())):
+    for place, node in nodes():
         if isinstance(node, ast.Call) and len([a for a in node.args if not isinstance(a, ast.Starred)]) > MOST:
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
             if name not in VARIADIC:
-                found.append(f"line {node.lineno}: {name} is given {len(node.args)} arguments by their place")
+                found.append(f"{place}: {name} is given {len(node.args)} arguments by their place")
     assert not found, "\n".join(found)
 
 

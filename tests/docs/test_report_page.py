@@ -1,6 +1,7 @@
 """The page, the figures and the paper's tables, on results of every experiment and on what they must survive."""
 
 import copy
+import functools
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 from pathlib import Path
@@ -23,9 +24,20 @@ from dhtorch.viz.plots import Axis, Panel, Stroke, colours
 from dhtorch.viz.plots.markup import Markup, escape_html, make_tag
 
 REPO = Path(__file__).resolve().parents[2]
-RESULTS = [make() for make in archived.ALL]
 NAMES = [make.__name__ for make in archived.ALL]
-every = pytest.mark.parametrize("result", RESULTS, ids=NAMES)
+every = pytest.mark.parametrize("result", NAMES, indirect=True)
+
+
+@functools.cache
+def results():
+    """One result of every kind, in the order of ``NAMES``; nobody changes them."""
+    return [make() for make in archived.ALL]
+
+
+@pytest.fixture
+def result(request):
+    """The result of a name."""
+    return results()[NAMES.index(request.param)]
 
 
 def parse(markup):
@@ -86,13 +98,13 @@ def test_the_page_holds_every_scene_and_every_number(result):
 
 @pytest.mark.slow
 def test_several_results_stand_on_one_page_in_their_order():
-    tree = parse(page.render_report(RESULTS))
+    tree = parse(page.render_report(results()))
     links = [a for a in tree.iter("a") if a.get("class") != "skip"]
     sections = list(tree.iter("section"))
-    assert [a.text for a in links] == [r["experiment"] for r in RESULTS]
+    assert [a.text for a in links] == [r["experiment"] for r in results()]
     assert [a.get("href")[1:] for a in links] == [s.get("id") for s in sections]
     assert "could not be downloaded" in "".join(tree.find("body/header/p").itertext())
-    benchmark = {**RESULTS[0], "data": {**RESULTS[0]["data"], "name": "tum11"}}
+    benchmark = {**results()[0], "data": {**results()[0]["data"], "name": "tum11"}}
     said = "".join(parse(page.render_report([benchmark])).find("body/header/p").itertext())
     assert "does not name the sequences" in said and "could not be downloaded" not in said
 
@@ -163,12 +175,12 @@ def test_markup_is_escaped_once():
 
 
 def test_the_command_writes_a_page_and_nowhere_else(tmp_path, capsys):
-    kept = result_files.write_result(tmp_path / "sweep/a/result.json", RESULTS[0])
-    result_files.write_result(tmp_path / "sweep/b/result.json", RESULTS[1])
+    kept = result_files.write_result(tmp_path / "sweep/a/result.json", results()[0])
+    result_files.write_result(tmp_path / "sweep/b/result.json", results()[1])
     before = kept.read_bytes()
     assert report.main([str(tmp_path / "sweep"), "--html", str(tmp_path / "page.html")]) == 0
     assert "2 results" in capsys.readouterr().out
-    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page.render_report(RESULTS[:2])
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page.render_report(results()[:2])
     for target, reason in ((tmp_path / "sweep", "found a folder"), (kept, "ends in .html")):
         with pytest.raises(ValueError, match=reason):
             report.main([str(tmp_path / "sweep"), "--html", str(target)])
@@ -218,7 +230,7 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("result", [r for r in RESULTS if r["experiment"] in SOURCES], ids=list(SOURCES))
+@pytest.mark.parametrize("result", SOURCES, indirect=True)
 def test_every_figure_of_the_paper_stands_in_the_table_of_its_experiment(result):
     tables = layouts.layout_tables(result)
     for quoted in SOURCES[result["experiment"]]:
@@ -481,7 +493,7 @@ def test_figures_of_one_panel_stand_side_by_side():
     ]
 
 
-@pytest.mark.parametrize("result", [r for r in RESULTS if r["experiment"] in SOURCES], ids=list(SOURCES))
+@pytest.mark.parametrize("result", SOURCES, indirect=True)
 @pytest.mark.parametrize("one_scene", [False, True])
 def test_the_console_prints_the_papers_figures_also_for_one_scene(result, one_scene, capsys):
     if one_scene:
