@@ -12,7 +12,10 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = test -z "$(TORCH_INDEX)" || $(PIP) --retries 0 --timeout 15 --index-url "$(TORCH_INDEX)" torch \
 	|| echo "== found no torch for the CPU at $(TORCH_INDEX): pip takes its own choice"
 
-.PHONY: run test test-all everything fuzz lint conf clean
+# Python files are compiled once, whatever the environment says: every process that a test starts loads them again.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: run test test-all everything fuzz style lint conf clean
 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
@@ -22,9 +25,11 @@ run: $(VENV)/.installed
 	@echo "== Next, your own capture:  . $(BIN)/activate && dhtorch PATH     (or without activating: $(BIN)/dhtorch PATH)"
 	@echo "   A demo with a 3D page: dhtorch demo. All commands: dhtorch --help"
 
-test: $(VENV)/.installed-dev lint
-	@echo "== tests (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
-	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+test: $(VENV)/.installed-dev style
+	@echo "== tests, and types beside them (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
+	@$(BIN)/mypy >$(VENV)/types.log 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS); tests=$$?; \
+	wait $$types; types=$$?; echo "== types"; cat $(VENV)/types.log; exit $$((tests | types))
 	@echo "== done; nothing was written outside $(VENV), the caches and temporary folders"
 
 # Everything that can be tested on one machine, in an environment of its own: the peers (Ray, Rerun, COLMAP, Open3D) are
@@ -41,10 +46,13 @@ fuzz: $(VENV)/.installed-dev
 	@echo "== hostile files"
 	$(BIN)/python benchmarks/fuzz.py $(ARGS)
 
-lint: $(VENV)/.installed-dev
-	@echo "== lint, format, types"
+style: $(VENV)/.installed-dev
+	@echo "== lint, format"
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+lint: style
+	@echo "== types"
 	$(BIN)/mypy
 
 # The settings of the methods, written from their records.

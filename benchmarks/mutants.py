@@ -268,7 +268,7 @@ def planted(source: str, fault: Fault) -> str:
     inside = source[first:last]
     changed = source[:first] + inside.replace(fault.old, fault.new) + source[last:]
     if not _is_cpp(source):
-        ast.parse(changed)
+        ast.parse(_dedented(changed[first : last + len(changed) - len(source)]))
     return changed
 
 

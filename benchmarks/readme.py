@@ -177,9 +177,7 @@ def chosen_views(*results: str) -> str:
 
 def beside_chosen() -> str:
     """View selection beside every fixed gap: coverage, false answers, cost."""
-    study, stress = (
-        read_json(RESULTS / f"{name}.json")["summary"] for name in ("views_study", "stress")
-    )
+    study, stress = (read_json(RESULTS / f"{name}.json")["summary"] for name in ("views_study", "stress"))
     timed = {r["name"]: r["ratio"] for r in read_json(RESULTS / "stream.json") if r["threads"] == 1}
     worst, turned, wrong = (s[f"auto.{n}"]["value"] for s, n in zip((study, study, stress), BESIDE, strict=True))
     rows = [

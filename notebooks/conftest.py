@@ -10,7 +10,13 @@ import pytest
 KERNEL_START_S = 600
 
 #: Notebooks that take half a minute or more each.
-SLOW = ("0_quickstart.ipynb", "3_beside_dinov2.ipynb", "4_gradients.ipynb", "5_your_own_capture.ipynb")
+SLOW = (
+    "0_quickstart.ipynb",
+    "1_one_pair.ipynb",
+    "3_beside_dinov2.ipynb",
+    "4_gradients.ipynb",
+    "5_your_own_capture.ipynb",
+)
 
 nbmake.nb_run.NotebookClient = partial(nbmake.nb_run.NotebookClient, startup_timeout=KERNEL_START_S)
 

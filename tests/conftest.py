@@ -15,12 +15,15 @@ import signal
 import numpy as np
 import pytest
 import torch
+from support import computed_once
 
 from dhtorch.runtime import console
 
 torch.set_num_threads(1)
 console._LINE_INTERVAL_S = math.inf  # no line of progress among the errors that a test compares, on a slow machine
 signal.signal(signal.SIGINT, signal.default_int_handler)
+computed_once.parse_settings_once()
+computed_once.render_once()
 
 
 #: Without a GPU torch.manual_seed notes a call stack for the GPUs that may come, 1.4 ms of each test's time.

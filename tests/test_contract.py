@@ -867,10 +867,16 @@ def test_vmap_is_a_batch(row):
     equal(tuple(leaves(row.fn(*args))), tuple(mapped), atol=1e-9)
 
 
+#: Stages whose steps others of these capture, too.
+CAPTURED_BY_OTHERS = {"make_prior", "relative_prior", "reject_misaligned", "refine_tracks"}
+
+
 def captured():
-    """Rows that are captured; those of geometry, which the stages capture with themselves, among the slow tests."""
+    """Rows that are captured; those of geometry, which the stages capture with themselves, and of single experiments among
+    the slow tests."""
     for row in (row for row in ROWS if "capture" in row.promises.split()):
-        is_inner = row.fn.__module__.startswith("dhtorch.geometry.")
+        is_inner = row.fn.__module__.startswith(("dhtorch.geometry.", "dhtorch.experiments."))
+        is_inner |= row.fn.__name__ in CAPTURED_BY_OTHERS
         param = case(row, "capture")
         yield pytest.param(*param.values, id=param.id, marks=[*param.marks, *[pytest.mark.slow] * is_inner])
 

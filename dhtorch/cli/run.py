@@ -8,6 +8,7 @@ overrides in a sweep, and returns its state instead of raising, so that a failin
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import logging
@@ -394,21 +395,22 @@ def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
         for other in names[1:]
         for option in words.iter_option_names(_load_settings(folder / group / f"{other}.yaml"))
     ]
-    readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else []
+    readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else ()
     words.validate_option_names(
         argv, composed, groups, [*swept_names, *words.list_reader_options(composed, readers)], _IMPLIED_CHOICES
     )
     return composed, words.add_reader_options(argv, composed, readers)
 
 
-def _reader_options(folder: Path) -> list[str]:
+@functools.cache
+def _reader_options(folder: Path) -> tuple[str, ...]:
     """Option names of the capture readers, without those common to all readers."""
     data_settings = [_load_settings(path) for path in sorted((folder / "data").glob("*.yaml"))]
     reader_settings = [
         settings for settings in data_settings if str(settings.get("_target_", "")).endswith(".open_capture")
     ]
     common = set.intersection(*map(set, reader_settings))
-    return list(dict.fromkeys(name for settings in reader_settings for name in settings if name not in common))
+    return tuple(dict.fromkeys(name for settings in reader_settings for name in settings if name not in common))
 
 
 def _load_settings(path: Path) -> Any:

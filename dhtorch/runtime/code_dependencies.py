@@ -44,8 +44,12 @@ def find_reachable_modules(names: Iterable[str], folder: str | Path | None = Non
     folder = Path(__file__).parents[1] if folder is None else Path(folder)
     files: dict[str, Path] = {}
     waiting = list(names)
+    visited: set[str] = set()
     while waiting:
         name = waiting.pop()
+        if name in visited:
+            continue
+        visited.add(name)
         for key, path in _find_module_files(name, folder).items():
             if key in files:
                 continue

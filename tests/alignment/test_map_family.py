@@ -97,7 +97,14 @@ def test_disparity_that_is_stated_is_aligned(room):
     assert trace["chosen"].family is None
 
 
-@pytest.mark.parametrize("name", ["none", *depth_faults.DEPTH_FAULTS])
+#: Every third fault; the others run with the slow tests.
+FAULTS = [
+    pytest.param(name, marks=[pytest.mark.slow] * (k % 3 > 0))
+    for k, name in enumerate(["none", *depth_faults.DEPTH_FAULTS])
+]
+
+
+@pytest.mark.parametrize("name", FAULTS)
 def test_no_planted_fault_of_depth_is_taken_for_another_family(room, name):
     truth, near = room
     x = truth if name == "none" else depth_faults.apply_fault(name, truth)[0]

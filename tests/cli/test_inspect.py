@@ -119,7 +119,13 @@ WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
 BELOW = {n: ("", "one", "one/two")[k % 3] for k, n in enumerate(WRITTEN)} | {"ca1m": "", "rh20t": "one"}
 
 
-@pytest.mark.parametrize(("name", "below"), BELOW.items())
+#: Further layouts of formats of which one is among the others, and formats whose reader has tests of the same capture.
+SLOW = ("driving", "stray_depth_only", "record3d_exr", "record3d_mp4", "arkitscenes", "ca1m", "fod500")
+
+
+@pytest.mark.parametrize(
+    ("name", "below"), [pytest.param(*each, marks=[pytest.mark.slow] * (each[0] in SLOW)) for each in BELOW.items()]
+)
 def test_written_captures_are_found_and_shown(
     name: str, below: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

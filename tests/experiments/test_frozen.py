@@ -40,7 +40,9 @@ def test_an_option_that_follows_a_default_would_be_seen():
     assert [*left_open(partial(MAP_1.track.func, levels=5), "track")]
 
 
-@pytest.mark.parametrize(("first", "today", "views"), [(MAP_1, MAP, 1), (WINDOW_1, WINDOW, 3)])
+@pytest.mark.parametrize(
+    ("first", "today", "views"), [(MAP_1, MAP, 1), pytest.param(WINDOW_1, WINDOW, 3, marks=pytest.mark.slow)]
+)
 def test_today_s_method_of_that_name_answers_bit_for_bit_as_it_did(first, today, views):
     room = SyntheticRoom(n_frames=7, hw=(240, 320))
     others = [room[2 * k + 2] for k in range(views)]

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import itertools
 import json
 import os
 import shutil
@@ -618,8 +619,21 @@ def test_links_that_leave_a_data_set_are_not_read(robot, tmp_path, name):
         read_all(source)
 
 
-@pytest.mark.parametrize("content", ["null", "[]", "7", '"x"', "{}", "", '{"key": 1}', '{"key": null, "config": 3}'])
-@pytest.mark.parametrize("format", ["lerobot", "nerfstudio"])
+@pytest.mark.parametrize(
+    ("format", "content"),
+    [
+        ("lerobot", "null"),
+        ("lerobot", '{"key": null, "config": 3}'),
+        ("nerfstudio", ""),
+        ("nerfstudio", '{"key": 1}'),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in itertools.product(("lerobot", "nerfstudio"), ("[]", "7", '"x"', "{}"))
+        ),
+        *(pytest.param("lerobot", content, marks=pytest.mark.slow) for content in ("", '{"key": 1}')),
+        *(pytest.param("nerfstudio", text, marks=pytest.mark.slow) for text in ("null", '{"key": null, "config": 3}')),
+    ],
+)
 def test_metadata_of_other_types_are_no_folder_of_enrich(robot, tmp_path, capsys, content, format):
     out = tmp_path / "set"
     (out / "meta").mkdir(parents=True)

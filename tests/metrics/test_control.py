@@ -352,7 +352,9 @@ def test_bad_targets_raise(wrong):
 
 
 @pytest.mark.parametrize(("share", "few"), [(0.9, 0), (1.0, 0), (0.6, 0), (0.9, 12), (1.0, 20), (0.95, 0), (0.95, 12)])
-@pytest.mark.parametrize("target", [0.03, 0.08, 0.2])
+@pytest.mark.parametrize(
+    "target", [pytest.param(0.03, marks=pytest.mark.slow), 0.08, pytest.param(0.2, marks=pytest.mark.slow)]
+)
 def test_most_scenes_is_the_lowest_threshold_that_so_many_keep(target, share, few):
     scenes = scenes_of(12, seed=4)
     found = control.scene_quantile_threshold(scenes, target, share=share, few=few)

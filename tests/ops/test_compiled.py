@@ -72,8 +72,14 @@ def unused(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):
-    """A folder with the compiled file; one of a process, in which operations are registered once."""
+    """A folder with the compiled file; one of a process, in which operations are registered once. The library of the
+    user's cache, named after the sources, is copied where it is sound, and compiled otherwise."""
     folder = tmp_path_factory.mktemp("cache")
+    built = loader.library()
+    if built.is_file() and loader.problem(built) is None:
+        for path in (built, loader.manifest(built)):
+            shutil.copy2(path, folder)
+        return folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DHTORCH_CACHE", str(folder))
         builder.build()

@@ -32,7 +32,7 @@ from dhtorch import data
 from dhtorch.data import FormatError
 
 SAMPLES = CAPTURES | OTHER_INPUTS
-MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
+MUTANTS, MANY = 15, 2000  # of every format; the many run with the slow tests
 #: Captures by name; the other inputs, which ``make fuzz`` reads too, run with the slow tests.
 NAMES = [*CAPTURES, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHER_INPUTS)]
 
@@ -52,8 +52,14 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
     assert counts.total() == MANY
 
 
-@pytest.mark.parametrize("examples", [3, pytest.param(80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
-@pytest.mark.parametrize("name", NAMES)
+#: Formats of every seventh kind with few examples; the others, and many of all, run with the slow tests.
+EXAMPLES = [
+    *(pytest.param(name, 3, marks=[pytest.mark.slow] * (k % 7 > 0)) for k, name in enumerate(SAMPLES)),
+    *(pytest.param(name, 80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)]) for name in SAMPLES),
+]
+
+
+@pytest.mark.parametrize(("name", "examples"), EXAMPLES)
 def test_damage_that_hypothesis_looks_for(name: str, examples: int, tmp_path: Path) -> None:
     """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
     write, read = SAMPLES[name]

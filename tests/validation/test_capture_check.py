@@ -66,7 +66,15 @@ def test_a_stated_unit_is_not_announced(frames):
     assert check_capture(recording(frames, depth_unit=None, report=())).lines == []
 
 
-@pytest.mark.parametrize("convention", ["world_to_camera", "opengl", "wxyz", "mm", "world_to_camera+opengl"])
+@pytest.mark.parametrize(
+    "convention",
+    [
+        "wxyz",
+        "mm",
+        *(pytest.param(c, marks=pytest.mark.slow) for c in ("world_to_camera", "opengl")),
+        "world_to_camera+opengl",
+    ],
+)
 def test_refuted_poses_are_named_and_removed(convention, frames, true):
     parsed = parse_pose_convention(convention)
     spoilt = recording(frames, state_poses(true, parsed))
@@ -82,7 +90,7 @@ def test_refuted_poses_are_named_and_removed(convention, frames, true):
     assert check.lines[-1].endswith(f"(remedy: data.pose_convention={convention})")
 
 
-@pytest.mark.parametrize(("lag", "has_poses"), [(1, True), (3, False), (-2, True)])
+@pytest.mark.parametrize(("lag", "has_poses"), [pytest.param(1, True, marks=pytest.mark.slow), (3, False), (-2, True)])
 def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
     inside = [k for k in range(N) if 0 <= k - lag < N]
     late = [frames[k].replace(depth=frames[k - lag].depth) for k in inside]
@@ -97,7 +105,7 @@ def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
     assert not check_capture(corrected).findings
 
 
-@pytest.mark.parametrize("turn", ["left_right", "upside_down", "180"])
+@pytest.mark.parametrize("turn", ["left_right", pytest.param("upside_down", marks=pytest.mark.slow), "180"])
 def test_turned_depth_is_named_with_its_turn(turn, frames, true):
     flip = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[turn]
     spoilt = recording([f.replace(depth=f.depth.flip(flip)) for f in frames], true)
@@ -117,7 +125,10 @@ def test_a_factor_near_1_is_a_scale_without_a_culprit(frames, true):
     assert str(finding) == finding.text
 
 
-@pytest.mark.parametrize(("top", "left"), [(10, 13), (0, 26), (19, 0)])
+@pytest.mark.parametrize(
+    ("top", "left"),
+    [(10, 13), pytest.param(0, 26, marks=pytest.mark.slow), pytest.param(19, 0, marks=pytest.mark.slow)],
+)
 def test_pictures_that_were_cropped_alone_are_named_with_their_intrinsics(top, left, frames, true):
     """80 % of each picture, enlarged to its size again: depth, poses and K stay those of the whole picture."""
 

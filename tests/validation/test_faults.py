@@ -117,8 +117,15 @@ def test_pairs_are_as_wide_as_tracks_hold(frames):
     ]
 
 
-@pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("name", UNIT_FACTORS)
+#: Every unit, one in the capture's own depth and the next in maps that are given; the other half among the slow tests.
+UNITS = [
+    pytest.param(name, own, marks=[pytest.mark.slow] * (k % 2 == own))
+    for k, name in enumerate(UNIT_FACTORS)
+    for own in (True, False)
+]
+
+
+@pytest.mark.parametrize(("name", "own"), UNITS)
 def test_a_unit_is_named(name, own, frames, watched):
     spoilt = [frame.depth / UNIT_FACTORS[name] for frame in frames]
     shown, maps = planted(frames, spoilt, own)
