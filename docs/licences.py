@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def requirements() -> dict[str, list[str]]:
     return groups_by_name
 
 
+@cache
 def licence(package: str) -> str | None:
     """SPDX expression of an installed package, else what ``ELSEWHERE`` says; None where neither knows."""
     try:

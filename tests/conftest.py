@@ -22,6 +22,7 @@ from dhtorch.runtime import console
 torch.set_num_threads(1)
 console._LINE_INTERVAL_S = math.inf  # no line of progress among the errors that a test compares, on a slow machine
 signal.signal(signal.SIGINT, signal.default_int_handler)
+gc.set_threshold(20_000, 20, 20)  # reading thousands of tests, and parsing files, makes many objects that stay
 computed_once.parse_settings_once()
 computed_once.render_once()
 
@@ -43,10 +44,9 @@ def pytest_collectstart(collector):
 
 
 def pytest_collection_finish(session):
-    """The thousands of collected tests are no garbage: the collector does not visit them, and comes more rarely."""
+    """The thousands of collected tests are no garbage: the collector does not visit them again."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.hookimpl(tryfirst=True)
