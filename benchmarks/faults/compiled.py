@@ -9,6 +9,7 @@ def _of(*names: str) -> list[str]:
 
 TESTS: dict[str, list[str]] = {
     "ops.csrc.pose": _of("a_pose_from_near_points_agrees_up_to_rounding", "the_reasons_for_no_pose_agree"),
+    "ops.csrc.filters": _of("components_and_torn_pixels_are_equal"),
     "ops.csrc.lens": _of("pixels_of_a_lens_are_the_same_bits", "tracks_in_ideal_pixels_are_the_same_bits"),
     "ops.csrc.linear": _of(
         "solutions_of_small_systems_agree_up_to_rounding",
@@ -44,6 +45,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("axes", "found[2][i] = third[i];", "found[2][i] = second[i];"),
         ("p3p", "t -= R * X[0][c];", "t += R * X[0][c];"),
         ("take", "from[4 * N + of[k]] - c[1]) / fy", "from[4 * N + of[k]] - c[1]) / fx"),
+    ],
+    "ops.csrc.filters": [
+        ("small_components", "x > 0) visit(across[y * (w - 1) + x - 1]", "x > 0) visit(across[y * (w - 1) + x]"),
+        ("small_components", "component.size()) >= n_pixels", "component.size()) > n_pixels"),
+        ("torn_pixels", "returned[m] && ", ""),
+        ("torn_pixels", "step <= 2", "step <= 1"),
     ],
     "ops.csrc.lens": [
         ("distort", "b = 2.0f * (y * (along + p2) + x * p1);", "b = 2.0f * (y * (along + p1) + x * p2);"),

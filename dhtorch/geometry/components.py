@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.ops.dispatch import operator
+
 
 @torch.no_grad()
 def small_components(mask: Tensor, n_pixels: int, *, same: tuple[Tensor, Tensor] | None = None) -> Tensor:
@@ -28,6 +30,24 @@ def small_components(mask: Tensor, n_pixels: int, *, same: tuple[Tensor, Tensor]
     right, down = mask[..., 1:] & mask[..., :-1], mask[:, 1:] & mask[:, :-1]
     if same is not None:
         right, down = right & same[0], down & same[1]
+    return _small(mask, right, down, n_pixels=n_pixels)
+
+
+def _small_kernel(mask: Tensor, right: Tensor, down: Tensor, *, n_pixels: int) -> Tensor:
+    small = torch.empty_like(mask, memory_format=torch.contiguous_format)
+    torch.ops.dhtorch.small_components.default(
+        mask.contiguous(), right.contiguous(), down.contiguous(), small, n_pixels
+    )
+    return small
+
+
+@operator(
+    kernel=_small_kernel,
+    dtypes=dict.fromkeys(("mask", "right", "down"), torch.bool),
+    any_layout=("mask", "right", "down"),
+)
+def _small(mask: Tensor, right: Tensor, down: Tensor, *, n_pixels: int) -> Tensor:
+    """:func:`small_components` of a mask whose pixels are connected to the right and down."""
     b, h, w = mask.shape
     far = b * h * w
     label = torch.arange(far, device=mask.device, dtype=torch.int32).view(b, h, w)

@@ -176,11 +176,7 @@ def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tens
     front of it (B, N). Gradient: to everything."""
     check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     T, camera = view.T_1_from_0, view.camera
-    if camera.distortion is None:
-        motion = T.R, T.t, view.shutter_rate
-        return _project_pinhole(ray, q, *motion, camera.f, camera.c)
-    xyz, in_front = _transform_points(ray, q, T.R, T.t, view.shutter_rate)
-    return cam.project(camera, torch.stack(xyz, -1)), in_front
+    return _project(ray, q, T.R, T.t, view.shutter_rate, *(camera.f, camera.c, camera.distortion))
 
 
 def _transform_points(
@@ -195,25 +191,34 @@ def _transform_points(
     return [torch.where(in_front, component, 1.0) for component in (x, y, z)], in_front
 
 
-def _project_pinhole_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
-    ray, q, R, t, shutter_rate, f, c = tensors
+def _project_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
+    ray, q, R, t, shutter_rate, f, c, distortion = tensors
     planes = ray.mT.contiguous()
     uv = torch.empty_like(planes[:, :2])
     in_front = torch.empty_like(q, dtype=torch.bool)
     motion = R, t, torch.zeros_like(t) if shutter_rate is None else shutter_rate
-    torch.ops.dhtorch.project_inverse_depth.default(planes, q, *motion, f, c, *(uv, in_front), MIN_DEPTH_RATIO)
+    lens = t.new_empty(0, 0) if distortion is None else distortion
+    torch.ops.dhtorch.project_inverse_depth.default(planes, q, *motion, f, c, lens, *(uv, in_front), MIN_DEPTH_RATIO)
     return uv.mT, in_front
 
 
+def _has_known_lens(*tensors: Any) -> bool:
+    """Whether the lens has as many coefficients as a model of :mod:`dhtorch.geometry.camera`."""
+    return tensors[-1] is None or tensors[-1].shape[-1] in cam.COEFFICIENTS
+
+
 @operator(
-    kernel=_project_pinhole_kernel,
-    dtypes=dict.fromkeys(("ray", "q", "R", "t", "shutter_rate", "f", "c"), torch.float32),
+    kernel=_project_kernel,
+    dtypes=dict.fromkeys(("ray", "q", "R", "t", "shutter_rate", "f", "c", "distortion"), torch.float32),
     any_layout=("ray",),
+    when=_has_known_lens,
 )
-def _project_pinhole(*tensors: Any) -> tuple[Tensor, Tensor]:
-    """:func:`project_inverse_depth` into a camera without distortion."""
-    ray, q, R, t, shutter_rate, f, c = tensors
+def _project(*tensors: Any) -> tuple[Tensor, Tensor]:
+    """:func:`project_inverse_depth` under a motion, into a camera's intrinsics."""
+    ray, q, R, t, shutter_rate, f, c, distortion = tensors
     (x, y, z), in_front = _transform_points(ray, q, R, t, shutter_rate)
+    if distortion is not None:
+        return cam.project(Camera(f, c, distortion), torch.stack((x, y, z), -1)), in_front
     axes = [component / z * f[:, k, None] + c[:, k, None] for k, component in enumerate((x, y))]
     return torch.stack(axes, 1).mT, in_front
 

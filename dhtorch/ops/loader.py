@@ -59,7 +59,7 @@ SOURCES = tuple(
     FOLDER / f"{part}.cpp"
     for part in (
         *("sweep", "search", "affine", "pyramid", "fit", "windows"),
-        *("tokens", "pose", "tracks", "lens", "linear", "parallax"),
+        *("tokens", "pose", "tracks", "lens", "linear", "parallax", "filters"),
     )
 )
 

@@ -24,6 +24,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.geometry.checks import is_static
 from dhtorch.geometry.components import small_components
 from dhtorch.geometry.windows import window_extreme
+from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.records import DepthMap
 
@@ -217,7 +218,30 @@ def _torn(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
 
     Depths that differ by more than ``seam_ratio`` are those of two surfaces that look alike.
     """
-    q, sigma, usable, swept = known
+    return _torn_pixels(*known, grey, options=options)
+
+
+def _torn_pixels_kernel(
+    q: Tensor, sigma: Tensor, usable: Tensor, swept: Tensor, grey: Tensor, *, options: DenseOptions
+) -> Tensor:
+    maps = [x.contiguous() for x in (q, sigma, usable, swept, grey)]
+    torn = torch.empty_like(maps[3])
+    limits = options.seam_sigmas, options.seam_ratio, options.grey_similarity
+    torch.ops.dhtorch.torn_pixels.default(*maps, torn, *limits)
+    return torn
+
+
+_TORN_DTYPES = {
+    name: torch.bool if name in ("usable", "swept") else torch.float32
+    for name in ("q", "sigma", "usable", "swept", "grey")
+}
+
+
+@operator(kernel=_torn_pixels_kernel, dtypes=_TORN_DTYPES, any_layout=tuple(_TORN_DTYPES))
+def _torn_pixels(
+    q: Tensor, sigma: Tensor, usable: Tensor, swept: Tensor, grey: Tensor, *, options: DenseOptions
+) -> Tensor:
+    """:func:`_torn` of maps (B, h, w)."""
     out = torch.zeros_like(swept)
     for step in (1, 2):
         for dy, dx in _SIDES:

@@ -24,6 +24,7 @@ from dhtorch import WINDOW, codes
 from dhtorch.codes import PoseCode, Source
 from dhtorch.geometry import (
     affine_alignment,
+    components,
     epipolar,
     least_squares,
     map_estimate,
@@ -43,7 +44,7 @@ from dhtorch.geometry.map_estimate import estimate_noise_variance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import builder, constants, dispatch, loader
-from dhtorch.pipeline import dense, surface
+from dhtorch.pipeline import dense, map_filters, surface
 from dhtorch.pipeline.pair import merge, undistort_tracks
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
@@ -406,13 +407,14 @@ def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, m
 
 
 @needs_compiler
-@pytest.mark.parametrize("turning", [False, True])
-def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
+@pytest.mark.parametrize(("turning", "coefficients"), [(False, 0), (True, 0), (True, 5), (False, 8)])
+def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning, coefficients):
     g = torch.Generator().manual_seed(1)
     picture = torch.rand(2, 1, 6, 21, generator=g).mul(9).round() / 9  # equal neighbours are not darker
     assert torch.equal(*both_ways(lambda: plane_sweep.census_transform(picture), monkeypatch))
     ray = torch.rand(2, 500, 3, generator=g) - 0.5
-    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    lens = 0.2 * torch.rand(2, coefficients, generator=g) if coefficients else None
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]), lens)
     motion = se3.exp(0.5 * torch.randn(2, 6, generator=g))
     view = plane_sweep.SweptView(
         torch.zeros(2, 1, 4, 4), camera, motion, 0.1 * torch.randn(2, 3, generator=g) if turning else None
@@ -426,6 +428,29 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
         q = torch.rand(*shape, generator=g)
         smooth = both_ways(lambda q=q: neighbours.smooth_within_tolerance(q, torch.tensor([0.2, 0.5])), monkeypatch)
         assert torch.equal(*smooth)
+
+
+@needs_compiler
+@pytest.mark.parametrize("share", [0.3, 0.59, 0.9])
+def test_components_and_torn_pixels_are_equal(loaded, monkeypatch, share):
+    g = torch.Generator().manual_seed(0)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=g)
+
+    mask, cuts = uniform(2, 40, 53) < share, (uniform(2, 40, 52) < 0.9, uniform(2, 39, 53) < 0.9)
+    asked = counted(monkeypatch, "small_components"), counted(monkeypatch, "torn_pixels")
+    for n, same in ((2, None), (7, cuts), (30, cuts)):
+        found, expected = both_ways(lambda n=n, same=same: components.small_components(mask, n, same=same), monkeypatch)
+        assert torch.equal(found, expected) and 0 < int(expected.sum()) < int(mask.sum())
+    known = map_filters._Known(
+        1 + uniform(2, 40, 53), 0.2 * uniform(2, 40, 53), mask, ~mask & (uniform(2, 40, 53) < 0.8)
+    )
+    options = map_filters.DenseOptions()
+    grey = 0.1 * uniform(2, 40, 53)
+    found, expected = both_ways(lambda: map_filters._torn(known, grey, options), monkeypatch)
+    assert [len(x) for x in asked] == [3, 1]
+    assert torch.equal(found, expected) and 0 < int(expected.sum()) < int(known.swept.sum())
 
 
 @needs_compiler

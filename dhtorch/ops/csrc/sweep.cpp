@@ -269,37 +269,66 @@ void census_transform(Tensor grey, Tensor offsets, Tensor code) {
   }
 }
 
-// Pixels uv (B, 2, N) at which a pinhole camera sees points on rays (B, 3, N) at inverse depths q (B, N), and whether they
-// are in front of it (B, N) bool. R (B, 9), t, turn (B, 3), f, c (B, 2).
-void project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front,
-                           double min_depth_ratio) {
-  const int64_t B = q.size(0), N = q.size(1);
-  const float min_ratio = static_cast<float>(min_depth_ratio);
-  for (int64_t k = 0; k < B; ++k) {
-    const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
-    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *__restrict qk = data<float>(q) + N * k;
-    const float *__restrict ax = data<float>(ray) + 3 * N * k, *__restrict ay = ax + N, *__restrict az = ay + N;
-    float *__restrict u = data<float>(uv) + 2 * N * k, *__restrict v = u + N;
-    bool* __restrict before = data<bool>(front) + N * k;
+// Brown's rational model, in the order of operations of kornia's distort_points.
+struct Lens {
+  float k[8] = {};
+
+  void distort(float& x, float& y) const {
+    const float r2 = x * x + y * y, r4 = r2 * r2, r6 = r4 * r2;
+    const float radial =
+        (1.0f + k[0] * r2 + k[1] * r4 + k[4] * r6) / (1.0f + k[5] * r2 + k[6] * r4 + k[7] * r6);
+    const float u = x * radial + 2.0f * k[2] * x * y + k[3] * (r2 + 2.0f * x * x);
+    y = y * radial + k[2] * (r2 + 2.0f * y * y) + 2.0f * k[3] * x * y;
+    x = u;
+  }
+};
+
+// Motion and intrinsics of one source view.
+struct View {
+  const float *R, *t, *turn, *f, *c;
+  Lens lens;
+  float min_ratio;
+};
+
+// Pixels u, v of N points on rays (3, N) at inverse depths q, and whether they are in front.
+template <bool bent>
+void project(const View& to, const float* ray, const float* __restrict q, int64_t N, float* __restrict u, float* __restrict v,
+             bool* __restrict front) {
+  const float *__restrict ax = ray, *__restrict ay = ax + N, *__restrict az = ay + N, *m = to.R, *w = to.turn;
 #pragma GCC ivdep
-    for (int64_t n = 0; n < N; ++n) {
-      const float a = ax[n], b = ay[n], d = az[n];
-      float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
-      float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
-      float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
-      const float p = w[0] * b, o = w[1] * b, s = w[2] * b;
-      const float dx = o * z - s * y, dy = s * x - p * z, dz = p * y - o * x;
-      x = x + dx;
-      y = y + dy;
-      z = z + dz;
-      const bool ahead = z > min_ratio;
-      before[n] = ahead;
-      x = ahead ? x : 1.0f;
-      y = ahead ? y : 1.0f;
-      z = ahead ? z : 1.0f;
-      u[n] = x / z * fk[0] + ck[0];
-      v[n] = y / z * fk[1] + ck[1];
-    }
+  for (int64_t n = 0; n < N; ++n) {
+    const float a = ax[n], b = ay[n], d = az[n];
+    float x = (a * m[0] + b * m[1] + d * m[2]) + q[n] * to.t[0];
+    float y = (a * m[3] + b * m[4] + d * m[5]) + q[n] * to.t[1];
+    float z = (a * m[6] + b * m[7] + d * m[8]) + q[n] * to.t[2];
+    const float p = w[0] * b, o = w[1] * b, s = w[2] * b;
+    const float dx = o * z - s * y, dy = s * x - p * z, dz = p * y - o * x;
+    x = x + dx;
+    y = y + dy;
+    z = z + dz;
+    const bool ahead = z > to.min_ratio;
+    front[n] = ahead;
+    z = ahead ? z : 1.0f;
+    float across = (ahead ? x : 1.0f) / z, along = (ahead ? y : 1.0f) / z;
+    if (bent) to.lens.distort(across, along);
+    u[n] = across * to.f[0] + to.c[0];
+    v[n] = along * to.f[1] + to.c[1];
+  }
+}
+
+// Pixels uv (B, 2, N) at which a camera sees points on rays (B, 3, N) at inverse depths q (B, N), and whether they are in
+// front of it (B, N) bool. R (B, 9), t, turn (B, 3), f, c (B, 2), distortion (B, k), or (0, 0) without a lens.
+void project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor distortion,
+                           Tensor uv, Tensor front, double min_depth_ratio) {
+  const int64_t B = q.size(0), N = q.size(1), count = distortion.size(1);
+  const bool bent = distortion.size(0) > 0;
+  for (int64_t k = 0; k < B; ++k) {
+    View to = {data<float>(R) + 9 * k, data<float>(t) + 3 * k, data<float>(turn) + 3 * k, data<float>(f) + 2 * k,
+               data<float>(c) + 2 * k, {}, static_cast<float>(min_depth_ratio)};
+    if (bent) std::copy_n(data<float>(distortion) + count * k, count, to.lens.k);
+    const auto run = bent ? project<true> : project<false>;
+    float* u = data<float>(uv) + 2 * N * k;
+    run(to, data<float>(ray) + 3 * N * k, data<float>(q) + N * k, N, u, u + N, data<bool>(front) + N * k);
   }
 }
 
@@ -364,8 +393,8 @@ STABLE_TORCH_LIBRARY(dhtorch, m) {
       "Tensor(d!) some) -> ()");
   m.def("census_transform(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
   m.def(
-      "project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
-      "Tensor(b!) front, float min_depth_ratio) -> ()");
+      "project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, "
+      "Tensor distortion, Tensor(a!) uv, Tensor(b!) front, float min_depth_ratio) -> ()");
   m.def("smooth_within_tolerance(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
   m.def("second_best(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
 }
