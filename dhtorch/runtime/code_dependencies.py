@@ -81,16 +81,18 @@ def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
     first, *rest = name.split(".")
     if first != _PACKAGE:
         return _find_external_file(name)
+    packages = ["/".join((*rest[:length], "__init__.py")) for length in range(len(rest) + 1)]
     for length in range(len(rest), -1, -1):
-        base = folder.joinpath(*rest[:length])
-        if length and (path := base.with_suffix(".py")).is_file():
+        module = "/".join(rest[:length]) + ".py"
+        if length and (folder / module).is_file():
             break
-        if (path := base / "__init__.py").is_file():
+        if (folder / packages[length]).is_file():
+            module = packages[length]
             break
     else:
         return {}
-    packages = [p / "__init__.py" for p in path.parents if p == folder or folder in p.parents]
-    return {p.relative_to(folder).as_posix(): p for p in (path, *packages) if p.is_file()}
+    files = {name: folder / name for name in (module, *reversed(packages[:length]))}
+    return {name: path for name, path in files.items() if path.is_file()}
 
 
 def _find_external_file(name: str) -> dict[str, Path]:
