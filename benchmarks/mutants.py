@@ -33,7 +33,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, thread
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
@@ -508,6 +508,7 @@ def _run_tests(tree: Path, module: str, tests: Sequence[str], order: Mapping[str
         os.dup2(log, 1)
         os.dup2(log, 2)
         os.chdir(tree)
+        vars(thread)["_threads_queues"].clear()  # a process that a test forks would wait for this one's pool, and fail
         os.environ |= {"PYTHONPATH": str(tree), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "DHTORCH_OPS": "0"}
         if ".csrc." in module:
             os.environ["CXX"] = f"{sys.executable} {Path(__file__).resolve().with_name('cached_compiler.py')}"
