@@ -60,7 +60,10 @@ TESTS: dict[str, list[str]] = {
     "data.codecs.colmap": POSED,
     "data.readers.colmap": POSED,
     "data.readers.driving": READERS,
-    "data.readers.frames_dir": READERS,
+    "data.readers.frames_dir": [
+        *READERS,
+        f"{FOLDERS[0]}::test_depth_scale_is_codes_per_metre_or_metres_per_code",
+    ],
     "data.readers.image_table": [*FOLDERS, *READERS],
     "data.readers.lerobot": LEROBOT,
     "data.readers.lerobot_depth": LEROBOT,

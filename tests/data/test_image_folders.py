@@ -344,6 +344,7 @@ def test_fewer_poses_than_images_are_matched_by_number(tmp_path: Path) -> None:
     recording = data.open(tmp_path)
     assert recording.number.tolist() == [0, 2, 3] and recording.report == ("frame 1: no pose: left out",)
     torch.testing.assert_close(recording.poses.t[1], frames[2].T_world_from_cam.t[0])
+    assert data.open(tmp_path, fps=10).times.tolist() == pytest.approx([0.0, 0.2, 0.3])
     (tmp_path / "trajectory.log").write_text("\n".join(["0 0 9", *lines[1:5]]))
     with pytest.raises(FormatError, match=r"trajectory.log: poses: found 1, expected 4, one for each image"):
         data.open(tmp_path)
@@ -358,6 +359,18 @@ def test_intrinsics_by_rows_are_noticed(tmp_path: Path) -> None:
     recording = data.open(tmp_path)
     assert torch.equal(recording[0].camera.c, CAMERA.c)
     assert "intrinsic_matrix is by rows" in recording.report[0]
+
+
+@pytest.mark.parametrize(("apart_us", "paired"), [(400_000, True), (600_000, False)])
+def test_a_single_image_is_paired_within_half_a_second(tmp_path: Path, apart_us: int, paired: bool) -> None:
+    writers.write_open3d(tmp_path, walk(1))
+    for folder, stamp in (("color", 0), ("depth", apart_us)):
+        (tmp_path / folder / "00000.png").rename(tmp_path / folder / f"0000001-{stamp:012d}.png")
+    if paired:
+        assert len(data.open(tmp_path)) == 1
+    else:
+        with pytest.raises(FormatError, match="depth maps: found 1 for 1 images"):
+            data.open(tmp_path)
 
 
 def test_images_and_depth_are_paired_by_a_table_or_by_stamps(tmp_path: Path) -> None:

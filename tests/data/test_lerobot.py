@@ -148,7 +148,7 @@ def test_depth_codes_survive_both_pixel_formats(tmp_path: Path, depth_pixels: st
 def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
     frame = two_episodes()[0][0]
     depth = frame.depth.clone()
-    depth[0, :4], depth[0, 4:6], depth[0, 6:8], depth[0, 8:10] = 0, 12.0, 9.5, 0.011
+    depth[0, :4], depth[0, 4:6], depth[0, 6:8], depth[0, 8:10], depth[0, 10] = 0, 12.0, 9.5, 0.011, 0.3
     write_lerobot(tmp_path, [[frame.replace(depth=depth)]])
     got = data.open(tmp_path)[0].depth[0]
     assert not got[:6].any() and not got[8:10].any()  # never a made-up centimetre
@@ -181,6 +181,7 @@ def test_codes_to_metres(log: bool) -> None:
     assert not metres[[0, 1, 4094, 4095]].any() and (np.diff(metres[2:-2]) > 0).all()
     steps = np.diff(metres[2:-2])
     assert steps[-1] / steps[0] == pytest.approx((4 + 3.5) / (0.2 + 3.5) if log else 1, rel=0.01)
+    assert metres[1000] == pytest.approx(3.7 * (7.5 / 3.7) ** (1000 / 4095) - 3.5 if log else 0.2 + 3.8 * 1000 / 4095)
     with pytest.raises(FormatError, match="12-bit codes"):
         lerobot_depth.dequantise_depth(feature, np.array([4096], dtype=np.uint16), Path("x"))
     bad = LeRobotFeature("d", "video", (1, 1), {"video.depth_min": 5.0, "video.depth_max": 4.0})
