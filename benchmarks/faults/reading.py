@@ -298,7 +298,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("decode_hue_depth", "sixth / 6", "sixth / 5"),
         ("decode_hue_depth", "(b - r) / c + 2", "(b - r) / c + 4"),
         ("decode_hue_depth", "usable & ~jump", "usable"),
-        ("read", "header.hw[1] // 2)", "header.hw[1] // 2 + 1)"),
+        ("_Load.__call__", "picture[:, half:]", "picture[:, :half]"),
     ],
     "data.readers.rectified": [
         ("_LoadPair.__call__", "/ self.codes_per_px + self.doffs", "/ self.codes_per_px"),

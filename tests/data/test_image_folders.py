@@ -17,8 +17,10 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import open3d
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
 from dhtorch.testing import parts
 
@@ -325,6 +327,13 @@ def test_of_two_trajectories_the_optimised_one_is_read_and_the_other_compared(tm
     (tmp_path / "odometry.log").write_text("\n".join(last))
     assert float(data.open(tmp_path).report[0].split("at most ")[1].split(" m")[0]) > 5
     assert data.open(tmp_path, trajectory="odometry.log").poses.t[2].tolist() != recording.poses.t[2].tolist()
+
+
+def test_trajectories_are_compared_whatever_their_worlds_are() -> None:
+    poses = se3.to_matrix(se3.exp(torch.randn(4, 6, generator=torch.manual_seed(0), dtype=torch.float64))).numpy()
+    found = open3d._motion_from_first(poses[3] @ poses[:3])
+    np.testing.assert_allclose(found, open3d._motion_from_first(poses[:3]), atol=1e-12)
+    np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)
 
 
 def test_motions_between_frames_are_no_poses(tmp_path: Path) -> None:

@@ -430,6 +430,22 @@ def test_a_video_at_another_rate_with_a_frame_for_each_row_is_paired_by_order(tm
     assert recording.report[-1].endswith("has as many frames as rows, but at other times: paired by their order")
 
 
+@pytest.mark.parametrize(
+    ("written", "numbers", "times"),
+    [
+        (([4, 7, 9], [0.5, 0.6, 0.9]), [4, 7, 9], [0.5, 0.6, 0.9]),
+        (([4, 4, 9], [np.nan] * 3), [0, 1, 2], None),
+        (([4, np.nan, 9], [0.5, 0.4, 0.9]), [0, 1, 2], [0.0, 0.1, 0.2]),
+    ],
+)
+def test_a_capture_keeps_its_clock_where_that_increases(monkeypatch, written, numbers, times) -> None:
+    monkeypatch.setattr(lerobot_rows, "find_capture_columns", lambda _: True)
+    table = {name: np.array([-1, *x]) for name, x in zip(lerobot_rows._CAPTURE_COLUMNS, written, strict=True)}
+    own = np.arange(3)
+    found = lerobot_rows.read_capture_clock(None, table, own + 1, own, np.array([0.0, 0.1, 0.2]))
+    assert found[0].tolist() == numbers and (found[1] is None if times is None else found[1].tolist() == times)
+
+
 def test_a_wrong_stamp_does_not_reorder_numbered_rows(tmp_path: Path) -> None:
     write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
     file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"

@@ -98,6 +98,7 @@ def test_a_pair_of_middlebury_2005_states_what_it_assumes(tmp_path: Path) -> Non
     left, right = recording
     # A third of the size: f = 3740 / 3 px, disparity 90 / 3 px, and a shift of 270 / 3 px between the two principal points.
     assert left.camera.f[0, 0] == pytest.approx(3740 / 3) and float(right.camera.c[0, 0] - left.camera.c[0, 0]) == 90
+    assert left.camera.c.tolist() == [[231.0, 184.5]]
     assert not left.depth[0, :, :50].any() and (left.depth[0, :, 50:] > 0).all()
     assert float(left.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (90 / 3 + 270 / 3))
     assert float(right.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (91 / 3 + 270 / 3))
