@@ -332,7 +332,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("EpisodeSteps._numbers", "feature.spans[0].offset + 4 * size * steps.start", "feature.spans[0].offset"),
         ("EpisodeSteps._numbers", "[size * steps.start : size * steps.stop]", "[: size * len(steps)]"),
         ("EpisodeSteps.values", "for i in steps]", "for i in range(len(steps))]"),
-        ("EpisodeSteps.values", 'described.kind == "image"', 'described.kind != "text"'),
+        ("EpisodeSteps.values", 'described.kind == "image"', 'described.kind == "text"'),
     ],
     "data.readers.rosbag": [
         ("_open_pair", "times[0][pairs[:, 0]] / 1e9", "times[0][pairs[:, 0]] / 1e6"),
