@@ -293,6 +293,10 @@ def test_sens_folder_of_png_depth_in_another_unit(tmp_path: Path) -> None:
     recording = data.open(tmp_path)
     assert recording.depth_unit == DepthUnit(1 / 500, "_info.txt: m_depthShift")
     torch.testing.assert_close(recording[0].depth, 2 * frames[0].depth, atol=2e-3, rtol=0)
+    unstated = "".join(line for line in info.read_text().splitlines(True) if "m_depthShift" not in line)
+    (tmp_path / "_info.txt").write_text(unstated)
+    assert data.open(tmp_path).depth_unit == DepthUnit(1 / 1000)
+    info.write_text(unstated + "m_depthShift = 500\n")
     info.write_text(info.read_text().replace("= 500", "= many"))
     with pytest.raises(FormatError, match=r"_info.txt: m_depthShift: found many, expected a number"):
         data.open(tmp_path)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from support.box_scene import walk
 
 from dhtorch import data
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import simulator_hdf5
 from dhtorch.records import Frame
 from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 
@@ -50,6 +52,11 @@ def test_every_layout_is_read_back(tmp_path: Path, layout: str) -> None:
         assert step is None or recording.depth_unit.metres == pytest.approx(step)
         same_frames(pickle.loads(pickle.dumps(recording)), frames, 1e-6 if step is None else step / 2 + 1e-6)
     assert recordings[1].episode == 1 and recordings[1].camera_name == "front"
+
+
+def test_pictures_of_numbers_become_bytes() -> None:
+    numbers = np.array([[[0.0], [0.2], [0.5], [1.0], [1.5], [-0.1], [np.nan]]])
+    assert simulator_hdf5._to_bytes(numbers).ravel().tolist() == [0, 51, 128, 255, 255, 0, 0]
 
 
 def test_one_pose_source_suffices(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from support.box_scene import CAMERA, HW, check_same, pose, walk
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.data.readers import tum
+from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
 from dhtorch.testing import parts
@@ -45,6 +46,9 @@ def test_the_largest_code_is_no_depth(tmp_path: Path) -> None:
     depth = data.open(tmp_path)[0].depth[0]
     assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 0])
     assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
+    (tmp_path / "meta.json").write_text('{"depth_scale": 4000}')
+    unit = tum._find_unit(tmp_path, None, tum._CameraSource(CAMERA))
+    assert unit == DepthUnit(1 / 4000, "meta.json: depth_scale")
 
 
 def blank(n: int) -> list[Frame]:
@@ -97,12 +101,13 @@ def test_tum_bridges_no_gap_of_the_trajectory(tmp_path: Path) -> None:
     assert len(data.open(tmp_path, poses=False)) == 4
 
 
-def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sign", [1, -1])
+def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path, sign: int) -> None:
     writers.write_tum(tmp_path, walk(2))
     a, b = pose(0), pose(1)
     rows = [
         f"{100 + s:.4f} " + parts.format_row([*T.t[0], *(q * parts.rotation_to_xyzw(T.R[0].numpy()))])
-        for s, T, q in ((-0.004, a, 1), (0.012, b, -1))
+        for s, T, q in ((-0.004, a, 1), (0.012, b, sign))
     ]
     (tmp_path / "groundtruth.txt").write_text("# no camera named\n" + "\n".join(rows))
     recording = data.open(tmp_path)
