@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <type_traits>
 #include <vector>
 
 namespace {
@@ -58,6 +59,8 @@ struct Patch {
     corner[1] = static_cast<float>(row - reach);
     last = static_cast<float>(2 * reach);
   }
+
+  inline Vector clamped(Vector x, Vector y) const;
 };
 
 inline Vector within(Vector x, float most) {  // clamp to [0, most]; NaN becomes 0
@@ -95,137 +98,344 @@ inline void neighbours(const float* pixels, const int32_t* at, Vector& left, Vec
 #endif
 }
 
-// The window of image 0: six derivative images and T without its mean, and J, each one row padded with zeros to whole
-// vectors.
+// Bilinear values at positions; beyond the border the border's.
+inline Vector Patch::clamped(Vector x, Vector y) const {
+  const int32_t most = static_cast<int32_t>(last) - 1;
+  x = within(x, last);
+  y = within(y, last);
+  Bits column = __builtin_convertvector(x, Bits), row = __builtin_convertvector(y, Bits);
+  column = column < most ? column : Bits{} + most;
+  row = row < most ? row : Bits{} + most;
+  const Vector right = x - __builtin_convertvector(column, Vector), down = y - __builtin_convertvector(row, Vector);
+  const Bits first = row * static_cast<int32_t>(stride) + column;
+  int32_t at[LANES];
+  std::memcpy(at, &first, sizeof(at));
+  asm("" : "+m"(at));  // they are read from memory: shifting each out of the vector takes longer
+  Vector left[2], next[2];
+  neighbours(pixels, at, left[0], next[0]);
+  neighbours(pixels + stride, at, left[1], next[1]);
+  const Vector above = fused(right, next[0] - left[0], left[0]), below = fused(right, next[1] - left[1], left[1]);
+  return fused(down, below - above, above);
+}
+
+// Vectors of a window's pixels. A lane has the same column in all of them; rows lie below each other, and where the last
+// columns fill less than half of a vector, also beside each other in it.
+struct Block {
+  int64_t begin, end;             // of its vectors in the window
+  int64_t column, columns, rows;  // of the first vector
+  Lanes u;
+  std::vector<Lanes> top, bottom;  // v of the first and the last row of each vector, one in a lane
+};
+
+#ifdef __AVX512F__
+constexpr int64_t MOST_LINES = 6;  // rows of pixels that a row of a window is read from
+
+inline Vector pick(Vector a, Bits at, Vector b) {
+  return reinterpret_cast<Vector>(_mm512_permutex2var_ps(reinterpret_cast<__m512>(a), reinterpret_cast<__m512i>(at), reinterpret_cast<__m512>(b)));
+}
+
+// The pixels of a patch that the vectors of a block are read from, where these are few and none beyond its border: they are
+// picked from registers, as pixel after pixel from memory takes longer.
+struct Rectangles {
+  // Of each vector, one in a lane: x and y of the middle of its first row; first column and row, and how many more.
+  struct Place {
+    Lanes middle[2], first[2], more[2];
+  };
+
+  const float* pixels;
+  const int64_t stride;
+  Place* const places;
+  int64_t lines;     // rows of pixels that any vector of one row is read from; 0: too many
+  bool in_squares;  // vectors of several rows
+
+  Rectangles(std::vector<Place>& work, const Block& block, const Patch& patch, const Warp& warp)
+      : pixels(patch.pixels), stride(patch.stride), places(work.data()), lines(0), in_squares(false) {
+    const auto& W = warp.of;
+    const float ends[2] = {block.u.of[0], block.u.of[block.columns - 1]}, share = ends[1] - ends[0];
+    bool holds = true;
+    for (int axis = 0; axis < 2; ++axis) {
+      const float reach = std::abs(W[1][axis]) + std::abs(W[2][axis]);
+      holds = holds && W[0][axis] - reach >= 1.0f && W[0][axis] + reach <= patch.last - 2.0f;
+    }
+    const float across = std::abs(W[1][0]) * share, down = std::abs(W[1][1]) * share;
+    if (holds && block.rows == 1 && across < 2 * LANES - 3 && down < MOST_LINES - 2) lines = static_cast<int64_t>(down) + 3;
+    in_squares = holds && block.rows > 1;
+    if (!lines && !in_squares) return;
+    for (size_t k = 0; k < block.top.size(); ++k) {
+      const Vector top = load(block.top[k].of), bottom = load(block.bottom[k].of);
+      for (int axis = 0; axis < 2; ++axis) {
+        const Vector above = W[0][axis] + W[2][axis] * top, below = W[0][axis] + W[2][axis] * bottom;
+        const float left = W[1][axis] * ends[0], right = W[1][axis] * ends[1];
+        const Vector ab = above + left, cd = above + right, ef = below + left, gh = below + right;
+        const Vector least_above = ab < cd ? ab : cd, most_above = ab < cd ? cd : ab, least_below = ef < gh ? ef : gh,
+                     most_below = ef < gh ? gh : ef;
+        const Bits least = __builtin_convertvector(least_above < least_below ? least_above : least_below, Bits),
+                   most = __builtin_convertvector(most_above < most_below ? most_below : most_above, Bits);
+        store(above, places[k].middle[axis].of);
+        store(reinterpret_cast<Vector>(least), places[k].first[axis].of);
+        store(reinterpret_cast<Vector>(most - least), places[k].more[axis].of);
+      }
+    }
+  }
+
+  static int32_t lane(const Lanes& lanes, int64_t i) {
+    int32_t value;
+    std::memcpy(&value, lanes.of + i % LANES, sizeof(value));
+    return value;
+  }
+
+  // Bilinear values of vector `i`, a row, at positions beside its middle.
+  template <int LINES>
+  Vector in_row(int64_t i, Vector to_x, Vector to_y) const {
+    const Place& place = places[i / LANES];
+    const Vector x = place.middle[0].of[i % LANES] + to_x, y = place.middle[1].of[i % LANES] + to_y;
+    const int32_t column = lane(place.first[0], i), row = lane(place.first[1], i), last = lane(place.more[1], i) + 1;
+    const Bits columns = __builtin_convertvector(x, Bits), rows = __builtin_convertvector(y, Bits);
+    const Vector right = x - __builtin_convertvector(columns, Vector), down = y - __builtin_convertvector(rows, Vector);
+    const Bits at = columns - column, next = at + 1;
+    const float* first = pixels + row * stride + column;
+    Vector above, below;
+    for (int32_t k = 0; k < LINES; ++k) {
+      const float* from = first + std::min(k, last) * stride;
+      const Vector a = load(from), b = load(from + LANES), here = pick(a, at, b);
+      const Vector line = fused(right, pick(a, next, b) - here, here);
+      if (k < LINES - 1) above = k ? (rows == row + k ? line : above) : line;
+      if (k) below = k > 1 ? (rows == row + k - 1 ? line : below) : line;
+    }
+    return fused(down, below - above, above);
+  }
+
+  // Whether a vector of several rows is read from four rows of eight columns, and another four below each.
+  bool fits(int64_t i) const {
+    const Place& place = places[i / LANES];
+    return lane(place.more[0], i) < 7 && lane(place.more[1], i) < 4;
+  }
+
+  Vector in_square(int64_t i, Vector x, Vector y) const {
+    const Place& place = places[i / LANES];
+    const int32_t column = lane(place.first[0], i), row = lane(place.first[1], i), more = lane(place.more[1], i);
+    const Bits columns = __builtin_convertvector(x, Bits), rows = __builtin_convertvector(y, Bits);
+    const Vector right = x - __builtin_convertvector(columns, Vector), down = y - __builtin_convertvector(rows, Vector);
+    const Bits at = (rows - row) * 8 + columns - column;
+    const float* first = pixels + row * stride + column;
+    __m256 of[5];
+    for (int32_t k = 0; k < 5; ++k) of[k] = _mm256_loadu_ps(first + std::min(k, more + 1) * stride);
+    const auto join = [](__m256 a, __m256 b) { return reinterpret_cast<Vector>(_mm512_insertf32x8(_mm512_castps256_ps512(a), b, 1)); };
+    const auto along = [&](Vector a, Vector b) {
+      const Vector here = pick(a, at, b);
+      return fused(right, pick(a, at + 1, b) - here, here);
+    };
+    const Vector above = along(join(of[0], of[1]), join(of[2], of[3])), below = along(join(of[1], of[2]), join(of[3], of[4]));
+    return fused(down, below - above, above);
+  }
+};
+#endif
+
+// The window of image 0: its gradient, also times v, and T without its mean; and J; in vectors padded with zeros.
 struct Window {
   const Options& options;
   int64_t size, count, wide;
-  std::vector<float> u, v, inside, pictures, J;  // inside: 1 in the window, 0 in the padding
+  std::vector<Block> blocks;
+  std::vector<Lanes> v, inside, pixels;  // inside: all bits set in the window
+  double H[8][8];                        // lower half of the normal equations of the six derivative images, T and 1
+#ifdef __AVX512F__
+  std::vector<Rectangles::Place> places;
+#endif
 
-  Window(const Options& options, int64_t size)
-      : options(options), size(size), count(size * size), wide((count + LANES - 1) / LANES * LANES), u(wide), v(wide), inside(wide),
-        pictures(7 * wide), J(wide) {
+  Window(const Options& options, int64_t size) : options(options), size(size), count(size * size), wide(0) {
     const float step = 2.0f / static_cast<float>(size - 1);
     std::vector<float> place(size);  // as torch.linspace
     for (int64_t i = 0; i < size; ++i) {
       place[i] = i < size / 2 ? -1.0f + step * static_cast<float>(i) : 1.0f - step * static_cast<float>(size - 1 - i);
     }
-    for (int64_t i = 0; i < count; ++i) {
-      u[i] = place[i % size];
-      v[i] = place[i / size];
-      inside[i] = 1.0f;
+    for (int64_t column = 0; column < size; column += LANES) {
+      const int64_t columns = std::min(LANES, size - column), rows = LANES / columns;
+      Block block{wide, wide + (size + rows - 1) / rows, column, columns, rows, {}, {}, {}};
+      for (int64_t i = 0; i < rows * columns; ++i) block.u.of[i] = place[column + i % columns];
+      v.resize(block.end);
+      inside.resize(block.end);
+      for (int64_t i = 0; i < (block.end - wide) * LANES; ++i) {
+        const int64_t lane = i % LANES, row = i / LANES * rows + lane / columns;
+        const bool held = lane < rows * columns && row < size;
+        v[wide + i / LANES].of[lane] = held ? place[row] : 0.0f;
+        reinterpret_cast<int32_t*>(inside[wide + i / LANES].of)[lane] = -held;
+      }
+      block.top.resize((block.end - wide + LANES - 1) / LANES);
+      block.bottom.resize(block.top.size());
+      for (int64_t i = 0; i < block.end - wide; ++i) {
+        block.top[i / LANES].of[i % LANES] = place[i * rows];
+        block.bottom[i / LANES].of[i % LANES] = place[std::min(i * rows + rows, size) - 1];
+      }
+      blocks.push_back(block);
+      wide = block.end;
     }
+    pixels.resize(6 * wide + 1);  // rows are stored in whole vectors
+#ifdef __AVX512F__
+    places.resize(size / LANES + 1);
+#endif
   }
 
-  float* picture(int64_t k) { return pictures.data() + k * wide; }
-
-  float sum(const float* a) const {
-    Vector sums = {};
-    for (int64_t i = 0; i < wide; i += LANES) sums += load(a + i);
-    return total(sums);
+  enum Plane { G_X, G_Y, V_G_X, V_G_Y, T, J };  // V_G_X: v g_x
+  Lanes* plane(int64_t k) { return pixels.data() + k * wide; }
+  Vector at(int64_t k, int64_t vector) const { return load(pixels[k * wide + vector].of); }
+  static Vector masked(Vector x, const Lanes& kept) {
+    return reinterpret_cast<Vector>(reinterpret_cast<Bits>(x) & reinterpret_cast<Bits>(load(kept.of)));
   }
-
-  float sum(const float* a, const float* b) const {
-    Vector sums = {};
-    for (int64_t i = 0; i < wide; i += LANES) sums = fused(load(a + i), load(b + i), sums);
-    return total(sums);
-  }
+  Vector masked(Vector x, int64_t vector) const { return masked(x, inside[vector]); }
 
   void read(const Level& level, const float* q, int64_t batch) {
     const int64_t margin = options.margin, column = pixel(q[0], -margin, level.width - 2 * level.pad - 1 + margin),
                   row = pixel(q[1], -margin, level.rows - 2 * level.pad - 1 + margin);
     for (int64_t k = 0; k < 3; ++k) {
       const float* from = level.at(batch, (k + 1) % 3, column - size / 2, row - size / 2);
-      float* to = picture(k < 2 ? k : 6);
-      for (int64_t i = 0; i < size; ++i) std::copy_n(from + i * level.width, size, to + i * size);
+      for (const Block& block : blocks) {
+        const float* pixel = from + block.column;
+        for (int64_t i = block.begin, row = 0; i < block.end; ++i) {
+          for (int64_t beside = 0; beside < block.rows && row < size; ++beside, ++row, pixel += level.width) {
+            store(load(pixel), plane(k < 2 ? k : T)[i].of + beside * block.columns);  // over the end of the row before
+          }
+        }
+      }
     }
-    float* T = picture(6);
-    const float mean = sum(T) / static_cast<float>(count);
-    for (int64_t i = 0; i < count; ++i) T[i] -= mean;
-    for (int64_t i = 0; i < wide; i += LANES) {
-      const Vector along = load(&u[i]), across = load(&v[i]);
+    for (int64_t i = 0; i < wide; ++i) {
       for (int64_t k = 0; k < 2; ++k) {
-        const Vector g = load(picture(k) + i);
-        store(g * along, picture(2 + k) + i);
-        store(g * across, picture(4 + k) + i);
+        const Vector g = masked(at(k, i), i);
+        store(g, plane(k)[i].of);
+        store(g * load(v[i].of), plane(2 + k)[i].of);
       }
     }
+    Vector sum = {};
+    for (int64_t i = 0; i < wide; ++i) sum += masked(at(T, i), i);
+    const float mean = total(sum) / static_cast<float>(count);
+    for (int64_t i = 0; i < wide; ++i) store(masked(at(T, i) - mean, i), plane(T)[i].of);
   }
 
-  // Rows FIRST to LAST - 1 of the lower half of the pictures' products, and the rows' sums, in one pass.
-  template <int FIRST, int LAST>
-  void products(double (*H)[8]) {
-    constexpr int COUNT = (LAST * (LAST + 1) - FIRST * (FIRST + 1)) / 2;
-    Vector parts[(COUNT + LAST - FIRST + 3) / 4 * 4] = {};
-    for (int64_t i = 0; i < wide; i += LANES) {
-      Vector* to = parts;
-      for (int a = FIRST; a < LAST; ++a) {
-        const Vector own = load(picture(a) + i);
-        for (int b = 0; b <= a; ++b, ++to) *to = fused(own, load(picture(b) + i), *to);
-        *to++ += own;
+  // Sums over the window of x times 1, u, v, and of squares and products of these, from those of each block.
+  struct Moments {
+    Vector of[6] = {};  // 1, u, v, uu, uv, vv
+
+    void add(Vector x, Vector by_v, Vector u) {
+      of[0] += x;
+      of[1] = fused(u, x, of[1]);
+      of[2] += by_v;
+    }
+    void add(Vector x, Vector by_v, Vector by_vv, Vector u) {
+      add(x, by_v, u);
+      of[3] = fused(u * u, x, of[3]);
+      of[4] = fused(u, by_v, of[4]);
+      of[5] += by_vv;
+    }
+  };
+
+  void normal() {
+    Moments squares[3], linear[4];  // of g_x g_x, g_x g_y, g_y g_y; of g_x T, g_y T, g_x, g_y
+    Vector energy = {}, sum = {};
+    for (const Block& block : blocks) {
+      const Vector u = load(block.u.of);
+      Vector parts[3][3] = {}, with[4][2] = {};
+      for (int64_t i = block.begin; i < block.end; ++i) {
+        const Vector g_x = at(G_X, i), g_y = at(G_Y, i), across = load(v[i].of), second = across * across;
+        const Vector products[3] = {g_x * g_x, g_x * g_y, g_y * g_y};
+        for (int k = 0; k < 3; ++k) {
+          parts[k][0] += products[k];
+          parts[k][1] = fused(across, products[k], parts[k][1]);
+          parts[k][2] = fused(second, products[k], parts[k][2]);
+        }
       }
+      for (int64_t i = block.begin; i < block.end; ++i) {
+        const Vector g_x = at(G_X, i), g_y = at(G_Y, i), t = at(T, i), across = load(v[i].of);
+        const Vector products[4] = {g_x * t, g_y * t, g_x, g_y};
+        for (int k = 0; k < 4; ++k) {
+          with[k][0] += products[k];
+          with[k][1] = fused(across, products[k], with[k][1]);
+        }
+        energy = fused(t, t, energy);
+        sum += t;
+      }
+      for (int k = 0; k < 3; ++k) squares[k].add(parts[k][0], parts[k][1], parts[k][2], u);
+      for (int k = 0; k < 4; ++k) linear[k].add(with[k][0], with[k][1], u);
     }
-    float found[sizeof(parts) / sizeof(Vector)];
-    for (size_t k = 0; k < sizeof(found) / sizeof(float); k += 4) totals(parts[k], parts[k + 1], parts[k + 2], parts[k + 3], found + k);
-    const float* from = found;
-    for (int a = FIRST; a < LAST; ++a) {
-      for (int b = 0; b <= a; ++b) H[a][b] = *from++;
-      H[7][a] = *from++;
+    float S[3][8], L[4][4], rest[4];
+    for (int k = 0; k < 3; ++k) {
+      const Vector* of = squares[k].of;
+      totals(of[0], of[1], of[2], of[3], S[k]);
+      totals(of[4], of[5], Vector{}, Vector{}, S[k] + 4);
     }
-  }
-
-  // Lower half of the normal equations of the six derivative images, T and 1.
-  void normal(double (*H)[8]) {
-    products<0, 3>(H);
-    products<3, 5>(H);
-    products<5, 6>(H);
-    products<6, 7>(H);
+    for (int k = 0; k < 4; ++k) totals(linear[k].of[0], linear[k].of[1], linear[k].of[2], Vector{}, L[k]);
+    totals(energy, sum, Vector{}, Vector{}, rest);
+    constexpr int PRODUCT[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    for (int a = 0; a < 6; ++a) {
+      for (int b = 0; b <= a; ++b) H[a][b] = S[a % 2 + b % 2][PRODUCT[a / 2][b / 2]];
+      H[6][a] = L[a % 2][a / 2];
+      H[7][a] = L[2 + a % 2][a / 2];
+    }
+    for (int a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(options.damping);
+    H[6][6] = rest[0];
+    H[7][6] = rest[1];
     H[7][7] = static_cast<double>(count);
-    for (int64_t a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(options.damping);
   }
 
-  // Read J at a warp, in pixels of the patch; beyond its border the border's value.
-  void read_warped(const Patch& patch, const Warp& warp) {
+  // Read J at a warp, in pixels of the patch, beyond its border the border's value; and the inner products of the eight
+  // images with it.
+  void read_warped(const Patch& patch, const Warp& warp, float* sums) {
     const auto& W = warp.of;
-    const int32_t stride = static_cast<int32_t>(patch.stride), most = static_cast<int32_t>(patch.last) - 1;
-    for (int64_t i = 0; i < wide; i += LANES) {
-      const Vector along = load(&u[i]), across = load(&v[i]);
-      const Vector x = within(W[0][0] + W[2][0] * across + W[1][0] * along, patch.last),
-                   y = within(W[0][1] + W[2][1] * across + W[1][1] * along, patch.last);
-      Bits column = __builtin_convertvector(x, Bits), row = __builtin_convertvector(y, Bits);
-      column = column < most ? column : Bits{} + most;
-      row = row < most ? row : Bits{} + most;
-      const Vector right = x - __builtin_convertvector(column, Vector), down = y - __builtin_convertvector(row, Vector);
-      const Bits first = row * stride + column;
-      int32_t at[LANES];
-      std::memcpy(at, &first, sizeof(at));
-      asm("" : "+m"(at));  // they are read from memory: shifting each out of the vector takes longer
-      Vector left[2], next[2];
-      neighbours(patch.pixels, at, left[0], next[0]);
-      neighbours(patch.pixels + stride, at, left[1], next[1]);
-      const Vector above = fused(right, next[0] - left[0], left[0]), below = fused(right, next[1] - left[1], left[1]);
-      store(fused(down, below - above, above) * load(&inside[i]), &J[i]);
+    Moments with[2];  // of g_x J, g_y J
+    Vector by_T = {}, sum = {};
+    for (const Block& block : blocks) {
+      const Vector u = load(block.u.of), right = W[1][0] * u, down = W[1][1] * u;
+      Vector parts[2][2] = {};
+      const auto read = [&](const auto& value) {
+        const int64_t vectors = block.end - block.begin, step = wide;
+        Lanes* const own = pixels.data() + block.begin;
+        const Lanes* const kept = inside.data() + block.begin;
+        for (int64_t i = 0; i < vectors; ++i) {
+          const Vector there = masked(value(i), kept[i]);
+          store(there, own[J * step + i].of);
+          for (int k = 0; k < 2; ++k) {
+            for (int by_v = 0; by_v < 2; ++by_v) {
+              parts[k][by_v] = fused(load(own[(2 * by_v + k) * step + i].of), there, parts[k][by_v]);
+            }
+          }
+          by_T = fused(load(own[T * step + i].of), there, by_T);
+          sum += there;
+        }
+      };
+      const Lanes* const along = v.data() + block.begin;
+      const auto x = [&](int64_t i) { return W[0][0] + W[2][0] * load(along[i].of) + right; };
+      const auto y = [&](int64_t i) { return W[0][1] + W[2][1] * load(along[i].of) + down; };
+      const auto anywhere = [&](int64_t i) { return patch.clamped(x(i), y(i)); };
+#ifdef __AVX512F__
+      const Rectangles around(places, block, patch, warp);
+      const auto row = [&](auto lines) { read([&](int64_t i) { return around.in_row<lines>(i, right, down); }); };
+      if (around.lines == 3) {
+        row(std::integral_constant<int, 3>());
+      } else if (around.lines == 4) {
+        row(std::integral_constant<int, 4>());
+      } else if (around.lines == 5) {
+        row(std::integral_constant<int, 5>());
+      } else if (around.lines == 6) {
+        row(std::integral_constant<int, 6>());
+      } else if (around.in_squares) {
+        read([&](int64_t i) { return around.fits(i) ? around.in_square(i, x(i), y(i)) : anywhere(i); });
+      } else {
+        read(anywhere);
+      }
+#else
+      read(anywhere);
+#endif
+      for (int k = 0; k < 2; ++k) with[k].add(parts[k][0], parts[k][1], u);
     }
+    totals(with[0].of[0], with[1].of[0], with[0].of[1], with[1].of[1], sums);
+    totals(with[0].of[2], with[1].of[2], by_T, sum, sums + 4);
   }
 
-  void project(float* sums) {  // inner products of the eight images with J
-    Vector parts[8] = {};
-    for (int64_t i = 0; i < wide; i += LANES) {
-      const Vector there = load(&J[i]);
-      for (int64_t k = 0; k < 7; ++k) parts[k] = fused(load(picture(k) + i), there, parts[k]);
-      parts[7] += there;
-    }
-    for (int64_t k = 0; k < 8; k += 4) totals(parts[k], parts[k + 1], parts[k + 2], parts[k + 3], sums + k);
-  }
-
-  // Gain of J over T, and the mean square of the residual.
-  void quality(float* fit) {
-    float* T = picture(6);
-    const float energy = sum(T, T), gain = sum(T, J.data()) / (energy > 0.0f ? energy : 1.0f);
-    const float mean = (sum(J.data()) - gain * sum(T)) / static_cast<float>(count);
+  // Gain of J over T, and the mean square of the residual, from the inner products.
+  void quality(const float* sums, float* fit) const {
+    const float energy = static_cast<float>(H[6][6]), gain = sums[6] / (energy > 0.0f ? energy : 1.0f);
+    const float mean = (sums[7] - gain * static_cast<float>(H[7][6])) / static_cast<float>(count);
     Vector squares = {};
-    for (int64_t i = 0; i < wide; i += LANES) {
-      const Vector rest = (load(&J[i]) - gain * load(T + i) - mean) * load(&inside[i]);
+    for (int64_t i = 0; i < wide; ++i) {
+      const Vector rest = masked(at(J, i) - gain * at(T, i) - mean, i);
       squares += rest * rest;
     }
     fit[0] = gain;
@@ -236,12 +446,14 @@ struct Window {
   float share(const Warp& warp) const {
     const auto& W = warp.of;
     Vector sums = {};
-    for (int64_t i = 0; i < wide; i += LANES) {
-      Vector left = load(&inside[i]);
-      for (int64_t axis = 0; axis < 2; ++axis) {
-        left *= kept(W[0][axis] + W[2][axis] * load(&v[i]) + W[1][axis] * load(&u[i]));
+    for (const Block& block : blocks) {
+      const Vector u = load(block.u.of);
+      for (int64_t i = block.begin; i < block.end; ++i) {
+        const Vector across = load(v[i].of);
+        Vector left = Vector{} + 1.0f;
+        for (int64_t axis = 0; axis < 2; ++axis) left *= kept(W[0][axis] + W[2][axis] * across + W[1][axis] * u);
+        sums += masked(left, i);
       }
-      sums += left;
     }
     return total(sums) / static_cast<float>(count);
   }
@@ -298,10 +510,9 @@ bool invert(const double (*H)[8], float (*inverse)[8], const Options& o) {
 
 // The change of the warp by regression on the eight images.
 Warp change(const float (*inverse)[8], const float* sums, const Options& o) {
-  float solution[7];
-  for (int i = 0; i < 7; ++i) {
-    solution[i] = 0.0f;
-    for (int k = 0; k < 8; ++k) solution[i] += inverse[i][k] * sums[k];
+  float solution[8] = {};
+  for (int k = 0; k < 8; ++k) {
+    for (int i = 0; i < 8; ++i) solution[i] += inverse[k][i] * sums[k];  // it is symmetric
   }
   const float gain = std::clamp(solution[6], o.min_gain, o.max_gain);
   Warp found;
@@ -351,18 +562,16 @@ float furthest(const Warp& change) {  // largest motion of the window's corners 
   return std::max(most[0], most[1]);
 }
 
-// Gauss-Newton steps of one point from a warp in pixels of the patch; leaves J as read at the last warp.
-Warp gauss_newton(Window& window, const Patch& patch, const float (*inverse)[8], Warp warp, int64_t steps, float epsilon) {
+// Gauss-Newton steps of one point from a warp in pixels of the patch; leaves J and its inner products as read at the last.
+Warp gauss_newton(Window& window, const Patch& patch, const float (*inverse)[8], Warp warp, int64_t steps, float epsilon, float* sums) {
   const float half = static_cast<float>(window.size / 2);
   Warp taken, before;
   for (int64_t k = 0; k < steps; ++k) {
-    float sums[8];
-    window.project(sums);
     const Warp now = change(inverse, sums, window.options);
     taken = k ? extrapolate(now, taken, before, window.options.max_extrapolation) : now;
     before = now;
     warp = compose(warp, taken, half);
-    window.read_warped(patch, warp);
+    window.read_warped(patch, warp, sums);
     if (!(furthest(now) > epsilon)) break;
   }
   return warp;
@@ -379,44 +588,46 @@ void register_affine(Tensor source, Tensor target, Tensor q, Tensor place, Tenso
                         static_cast<float>(max_gain), damping, min_pivot};
   const Level here(source, source_pad), there(target, target_pad);
   const int64_t M = q.size(1);
+  const int64_t* pairs = data<int64_t>(batch);
+  const float *centres = data<float>(q), *points = data<float>(place), *starts = data<float>(begin);
+  float *ends = data<float>(warp), *fits = data<float>(fit), *firsts = data<float>(first), *inverses = data<float>(inverse);
+  bool* with_texture = data<bool>(textured);
   Window own(options, window);
   for (int64_t m = 0; m < M; ++m) {
-    const int64_t b = data<int64_t>(batch)[m];
-    const float at[2] = {data<float>(q)[m], data<float>(q)[M + m]};
-    own.read(here, at, b);
-    double H[8][8];
-    own.normal(H);
+    const float at[2] = {centres[m], centres[M + m]};
+    own.read(here, at, pairs[m]);
+    own.normal();
     float R[8][8];
-    const bool fine = invert(H, R, options);
+    const bool fine = invert(own.H, R, options);
     Warp now;
-    for (int k = 0; k < 6; ++k) now.of[k / 2][k % 2] = data<float>(begin)[k * M + m];
-    const Patch patch(there, b, now.of[0], window / 2 + search_padding);
+    for (int k = 0; k < 6; ++k) now.of[k / 2][k % 2] = starts[k * M + m];
+    const Patch patch(there, pairs[m], now.of[0], window / 2 + search_padding);
     for (int axis = 0; axis < 2; ++axis) now.of[0][axis] -= patch.corner[axis];
-    own.read_warped(patch, now);
-    float quality[3], kept[LANES];
-    own.quality(quality);
+    float quality[3], kept[LANES], sums[8];
+    own.read_warped(patch, now, sums);
+    own.quality(sums, quality);
     quality[2] = 1.0f;
     for (int axis = 0; axis < 2; ++axis) {
       store(Window::kept(Vector{} + now.of[0][axis]), kept);
       quality[2] *= kept[0];
     }
-    for (int k = 0; k < 3; ++k) data<float>(first)[k * M + m] = quality[k];
-    if (fine) now = gauss_newton(own, patch, R, now, steps, static_cast<float>(epsilon));
+    for (int k = 0; k < 3; ++k) firsts[k * M + m] = quality[k];
+    if (fine) now = gauss_newton(own, patch, R, now, steps, static_cast<float>(epsilon), sums);
     if (steps) {
-      own.quality(quality);
+      own.quality(sums, quality);
       quality[2] = own.share(now);
     }
-    for (int k = 0; k < 3; ++k) data<float>(fit)[k * M + m] = quality[k];
+    for (int k = 0; k < 3; ++k) fits[k * M + m] = quality[k];
     for (int axis = 0; axis < 2; ++axis) {
       now.of[0][axis] += patch.corner[axis];
       for (int k = 0; k < 8; ++k) {
         float row = 0.0f;
-        for (int i = 0; i < 3; ++i) row += R[2 * i + axis][k] * data<float>(place)[i * M + m];
-        data<float>(inverse)[(axis * 8 + k) * M + m] = row;
+        for (int i = 0; i < 3; ++i) row += R[2 * i + axis][k] * points[i * M + m];
+        inverses[(axis * 8 + k) * M + m] = row;
       }
     }
-    for (int k = 0; k < 6; ++k) data<float>(warp)[k * M + m] = now.of[k / 2][k % 2];
-    data<bool>(textured)[m] = fine;
+    for (int k = 0; k < 6; ++k) ends[k * M + m] = now.of[k / 2][k % 2];
+    with_texture[m] = fine;
   }
 }
 

@@ -46,7 +46,7 @@ struct Rows {
 
   Vector at(int64_t i, int64_t j) const {
     const float* pixel = from + i * width + j;
-    const Vector here = load(pixel);
+    const Vector here = kept_in_register(load(pixel));
     return exactly ? fused(right, load(pixel + 1) - here, here) : here;
   }
 };
@@ -71,13 +71,13 @@ inline Vector masked(Vector x, Bits kept) { return reinterpret_cast<Vector>(rein
 // normalisation; and sums over it: g T, A, T T.
 struct Window : Columns {
   int64_t count;
-  std::vector<float> planes;
+  std::vector<Lanes> planes;
   float moments[6];
 
-  explicit Window(int64_t size) : Columns(size), count(size * wide), planes(3 * count) {}
+  explicit Window(int64_t size) : Columns(size), count(size * wide), planes(3 * count / LANES) {}
 
-  float* plane(int64_t k) { return planes.data() + k * count; }
-  const float* plane(int64_t k) const { return planes.data() + k * count; }
+  float* plane(int64_t k) { return planes.front().of + k * count; }
+  const float* plane(int64_t k) const { return planes.front().of + k * count; }
 
   // Products of g_x, g_y and T, summed over the window.
   struct Products {
@@ -109,7 +109,7 @@ struct Window : Columns {
       const Bits inside = kept(j);
       Vector above[3];
       for (int64_t k = 0; k < 3; ++k) above[k] = rows[k].at(0, j);
-      float* to = planes.data() + j;
+      float* to = plane(0) + j;
       for (int64_t i = 0; i < size; ++i, to += wide) {
         Vector here[3];
         for (int64_t k = 0; k < 3; ++k) {
@@ -130,7 +130,7 @@ struct Window : Columns {
     Products products;
     for (int64_t j = 0; j < wide; j += LANES) {
       const Bits inside = kept(j);
-      for (float* at = planes.data() + j; at < planes.data() + count; at += wide) {
+      for (float* at = plane(0) + j; at < plane(1); at += wide) {
         Vector here[3] = {load(at), load(at + count), load(at + 2 * count)};
         change(here);
         for (int64_t k = 0; k < 3; ++k) {
@@ -165,62 +165,102 @@ struct Window : Columns {
   }
 };
 
-// The correlation map of one point: the window's K planes correlated with J (rows of `stride` pixels) at n x n offsets,
-// as Gauss-Newton steps. Only a few nodes are read, so each is computed on first use.
+// The correlation map of one point: the window's K planes correlated with J (rows of `stride` pixels) at n x n offsets from
+// the target's pixel `corner`, as Gauss-Newton steps. Only a few nodes are read, so each is computed on first use.
 template <int K>
 struct Map {
   const Window& window;
   const float *inverse, *moments, *J;
   int64_t stride, n;
+  float corner[2];
   uint64_t known;  // one bit per node
-  float field[K * MAX_NODES * MAX_NODES];  // of known nodes
+  float field[K][MAX_NODES * MAX_NODES];  // of known nodes, in rows of MAX_NODES
+  float cell[2], around[4][K];  // the position and the field of the first of four nodes, and of the others
 
-  Map(const Window& window, const float* inverse, const float* J, int64_t stride, int64_t n)
-      : window(window), inverse(inverse), moments(window.moments), J(J), stride(stride), n(n), known(0) {}
+  Map(const Window& window, const float* inverse)
+      : window(window), inverse(inverse), moments(window.moments), J(nullptr), stride(0), n(0), corner{}, known(0) {}
 
-  // R x M nodes, the first at row v and column u. Few nodes have a sum for each of a row's first vectors, which does not
-  // wait for the one before.
+  // Begin a map at another corner. A node of the map before that lies on it stays known.
+  void begin(const float* first, int64_t nodes) {
+    const int64_t right = static_cast<int64_t>(first[0] - corner[0]), down = static_cast<int64_t>(first[1] - corner[1]);
+    float before[K][MAX_NODES * MAX_NODES];
+    if (known) std::memcpy(before, field, sizeof(field));
+    uint64_t left = known;
+    known = 0;
+    for (; left; left &= left - 1) {
+      const int64_t node = __builtin_ctzll(left), row = node / MAX_NODES - down, column = node % MAX_NODES - right;
+      if (row < 0 || row >= nodes || column < 0 || column >= nodes) continue;
+      const int64_t to = row * MAX_NODES + column;
+      for (int k = 0; k < K; ++k) field[k][to] = before[k][node];
+      known |= uint64_t{1} << to;
+    }
+    n = nodes;
+    std::copy_n(first, 2, corner);
+    cell[0] = NAN;
+  }
+
+  // R x M nodes (R at most 2), the first at row v and column u. A row of J is multiplied by the window's row for the first
+  // row of nodes and by the one above it for the second. Few nodes have several sums, which do not wait for each other.
   template <int R, int M>
   void correlate(int64_t v, int64_t u) {
-    constexpr int64_t CHAINS = R * M * K > 4 ? 1 : 2;
-    Vector sums[CHAINS][K * R * M] = {};
-    for (int64_t i = 0; i < window.size; ++i) {
-      for (int64_t j = 0; j < window.wide; j += LANES) {
-        Vector* to = sums[CHAINS > 1 && j ? 1 : 0];
-        Vector own[K];
-        for (int k = 0; k < K; ++k) own[k] = load(window.plane(k) + i * window.wide + j);
-        for (int r = 0; r < R; ++r) {
-          for (int m = 0; m < M; ++m) {
-            const Vector there = load(J + (i + v + r) * stride + j + u + m);
-            for (int k = 0; k < K; ++k) to[(k * R + r) * M + m] = fused(own[k], there, to[(k * R + r) * M + m]);
+    constexpr int COUNT = K * R * M, CHAINS = COUNT > 4 ? 1 : 8 / COUNT;
+    Vector sums[CHAINS][COUNT] = {};
+    for (int64_t j = 0; j < window.wide; j += LANES) {
+      const float *own = window.plane(0) + j, *there = J + v * stride + j + u;
+      Vector above[K] = {};
+      const auto row = [&](int chain) {
+        Vector rows[K], pixels[M];
+        for (int k = 0; k < K; ++k) rows[k] = load(own + k * window.count);
+        for (int m = 0; m < M; ++m) pixels[m] = load(there + m);
+        for (int m = 0; m < M; ++m) {
+          for (int k = 0; k < K; ++k) sums[chain][k * R * M + m] = fused(rows[k], pixels[m], sums[chain][k * R * M + m]);
+          if constexpr (R == 2) {
+            for (int k = 0; k < K; ++k) sums[chain][(k * R + 1) * M + m] = fused(above[k], pixels[m], sums[chain][(k * R + 1) * M + m]);
           }
+        }
+        for (int k = 0; k < K; ++k) above[k] = rows[k];
+        own += window.wide;
+        there += stride;
+      };
+      int64_t i = 0;
+      for (; i + CHAINS <= window.size; i += CHAINS) {
+        for (int chain = 0; chain < CHAINS; ++chain) row(chain);
+      }
+      for (; i < window.size; ++i) row(0);
+      if constexpr (R == 2) {
+        for (int m = 0; m < M; ++m) {
+          const Vector pixels = load(there + m);
+          for (int k = 0; k < K; ++k) sums[0][(k * R + 1) * M + m] = fused(above[k], pixels, sums[0][(k * R + 1) * M + m]);
         }
       }
     }
-    Vector all[(K * R * M + 3) / 4 * 4] = {};
-    float C[(K * R * M + 3) / 4 * 4];
-    for (int k = 0; k < K * R * M; ++k) all[k] = CHAINS > 1 ? sums[0][k] + sums[CHAINS - 1][k] : sums[0][k];
-    for (int k = 0; k < K * R * M; k += 4) totals(all[k], all[k + 1], all[k + 2], all[k + 3], C + k);
+    Vector all[(COUNT + 3) / 4 * 4] = {};
+    float C[(COUNT + 3) / 4 * 4];
+    for (int k = 0; k < COUNT; ++k) {
+      all[k] = sums[0][k];
+      for (int chain = 1; chain < CHAINS; ++chain) all[k] += sums[chain][k];
+    }
+    for (int k = 0; k < COUNT; k += 4) totals(all[k], all[k + 1], all[k + 2], all[k + 3], C + k);
     for (int r = 0; r < R; ++r) {
       for (int m = 0; m < M; ++m) {
-        float own[K];
-        for (int k = 0; k < K; ++k) own[k] = C[(k * R + r) * M + m];
-        put((v + r) * n + u + m, own);
+        float node[K];
+        for (int k = 0; k < K; ++k) node[k] = C[(k * R + r) * M + m];
+        put((v + r) * MAX_NODES + u + m, node);
       }
     }
   }
 
   void put(int64_t node, const float* C) {
     const float a = C[0] - moments[0], b = C[1] - moments[1];
-    field[node] = inverse[0] * a + inverse[1] * b;
-    field[n * n + node] = inverse[1] * a + inverse[2] * b;
-    if constexpr (K == 3) field[2 * n * n + node] = moments[5] > 0.0f ? C[2] / moments[5] : 1.0f;
+    field[0][node] = inverse[0] * a + inverse[1] * b;
+    field[1][node] = inverse[1] * a + inverse[2] * b;
+    if constexpr (K == 3) field[2][node] = moments[5] > 0.0f ? C[2] / moments[5] : 1.0f;
     known |= uint64_t{1} << node;
   }
 
   // Four nodes, the first at row v and column u: those that are unknown, one or two of a row or column, else all.
   void ensure_four(int64_t v, int64_t u) {
-    const uint64_t at = known >> (v * n + u), below = at >> n;
+    const uint64_t at = known >> (v * MAX_NODES + u), below = at >> MAX_NODES;
     const uint64_t have = (at & 3) | (below & 3) << 2;
     if (have == 15) return;
     if (have == 3) return correlate<1, 2>(v + 1, u);
@@ -237,13 +277,22 @@ struct Map {
   // Bilinear interpolation of the field, which is zero beyond its border.
   void interpolate(const float* p, float* found) {
     const float u = std::floor(p[0]), v = std::floor(p[1]), last = static_cast<float>(n - 1);
-    if (!(u >= 0.0f && v >= 0.0f && u < last && v < last)) return interpolate_border(p, u, v, found);
-    const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
-    ensure_four(row, column);
-    const float right = p[0] - u, down = p[1] - v, left = 1.0f - right, up = 1.0f - down;
+    if (!(u == cell[0] && v == cell[1])) {  // most steps stay between the same nodes
+      if (!(u >= 0.0f && v >= 0.0f && u < last && v < last)) return interpolate_border(p, u, v, found);
+      const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v), node = row * MAX_NODES + column;
+      ensure_four(row, column);
+      for (int k = 0; k < K; ++k) {
+        around[0][k] = field[k][node];
+        around[1][k] = field[k][node + 1];
+        around[2][k] = field[k][node + MAX_NODES];
+        around[3][k] = field[k][node + MAX_NODES + 1];
+      }
+      cell[0] = u;
+      cell[1] = v;
+    }
+    const float right = p[0] - cell[0], down = p[1] - cell[1], left = 1.0f - right, up = 1.0f - down;
     for (int k = 0; k < K; ++k) {
-      const float* at = field + (k * n + row) * n + column;
-      found[k] = (at[0] * left + at[1] * right) * up + (at[n] * left + at[n + 1] * right) * down;
+      found[k] = (around[0][k] * left + around[1][k] * right) * up + (around[2][k] * left + around[3][k] * right) * down;
     }
   }
 
@@ -255,9 +304,10 @@ struct Map {
     const int64_t last[2] = {std::min(column + 1, n - 1), std::min(row + 1, n - 1)};
     for (int64_t i = first[1]; i <= last[1]; ++i) {
       for (int64_t j = first[0]; j <= last[0]; ++j) {
-        if (!(known >> (i * n + j) & 1)) correlate<1, 1>(i, j);
+        const int64_t node = i * MAX_NODES + j;
+        if (!(known >> node & 1)) correlate<1, 1>(i, j);
         const float weight = (1.0f - std::abs(p[0] - static_cast<float>(j))) * (1.0f - std::abs(p[1] - static_cast<float>(i)));
-        for (int k = 0; k < K; ++k) found[k] += field[(k * n + i) * n + j] * weight;
+        for (int k = 0; k < K; ++k) found[k] += field[k][node] * weight;
       }
     }
   }
@@ -294,9 +344,10 @@ struct State {
   bool live, held;
 };
 
-// Gauss-Newton steps of one point on a map whose first node is the target's pixel `corner`.
+// Gauss-Newton steps of one point on a map.
 template <int K>
-void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const Options& o, State& s) {
+void walk(Map<K>& map, const float* x, int64_t steps, const Options& o, State& s) {
+  const float* corner = map.corner;
   const float start[2] = {x[0] + s.d[0] - corner[0], x[1] + s.d[1] - corner[1]};
   float p[2] = {start[0], start[1]}, step[2] = {0.0f, 0.0f}, square = 0.0f;
   for (int64_t k = 1; s.live && k <= steps; ++k) {
@@ -352,13 +403,15 @@ struct Target {
 
 // One map of radius (n - 2) / 2 around a point's position, and the steps on it.
 template <int K>
-void on_map(Window& window, const float* inverse, Target& target, int64_t batch, int64_t n, const float* x, int64_t steps,
-            const Options& o, State& s) {
+void on_map(Map<K>& map, Target& target, int64_t batch, int64_t n, const float* x, int64_t steps, const Options& o, State& s) {
   const Level& level = target.level;
+  const Window& window = map.window;
   const float radius = static_cast<float>((n - 2) / 2);
   const float corner[2] = {level.corner(x[0] + s.d[0], 0) - radius, level.corner(x[1] + s.d[1], 1) - radius};
   const int64_t side = window.size + n - 1, stride = window.wide + LANES;
-  Map<K> map(window, inverse, level.at(batch, 0, corner[0], corner[1], window.size / 2), level.width, n);
+  map.begin(corner, n);
+  map.J = level.at(batch, 0, corner[0], corner[1], window.size / 2);
+  map.stride = level.width;
   if (s.live && !target.clean[batch] && !finite(map.J, map.stride, side, stride)) {  // perhaps only beside the patch
     float* patch = target.patch.data();
     for (int64_t i = 0; i < side; ++i) {
@@ -367,20 +420,21 @@ void on_map(Window& window, const float* inverse, Target& target, int64_t batch,
     map.J = patch;
     map.stride = stride;
     if (!finite(map.J, map.stride, side, stride)) {  // no step across NaN, as in torch
-      std::fill_n(map.field, K * n * n, NAN);
+      for (auto& plane : map.field) std::fill(std::begin(plane), std::end(plane), NAN);
       map.known = ~uint64_t{0};
     }
   }
-  walk<K>(map, corner, x, steps, o, s);
+  walk<K>(map, x, steps, o, s);
 }
 
 template <int K>
-void search_point(Window& window, const float* inverse, Target& target, int64_t batch, const float* x, const int64_t* radii,
-                  int64_t maps, const Options& o, State& s) {
+void search_point(const Window& window, const float* inverse, Target& target, int64_t batch, const float* x,
+                  const int64_t* radii, int64_t maps, const Options& o, State& s) {
+  Map<K> map(window, inverse);
   for (int64_t k = 0; k < maps; ++k) {
     const int64_t steps = std::min(o.steps_per_map, o.iterations - k * o.steps_per_map);
     if (k && (steps <= 0 || !s.live)) return;
-    on_map<K>(window, inverse, target, batch, 2 * radii[k] + 2, x, steps, o, s);
+    on_map<K>(map, target, batch, 2 * radii[k] + 2, x, steps, o, s);
   }
 }
 

@@ -32,6 +32,11 @@ constexpr int64_t LANES = 8;
 typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
 typedef int32_t Bits __attribute__((vector_size(LANES * sizeof(int32_t))));
 
+// Floats of a vector, aligned so that none of its loads crosses a cache line.
+struct alignas(Vector) Lanes {
+  float of[LANES];
+};
+
 template <typename T>
 T* data(const Tensor& x) {
   return static_cast<T*>(x.data_ptr());
@@ -41,6 +46,16 @@ inline Vector load(const float* from) {
   Vector found;
   std::memcpy(&found, from, sizeof(found));
   return found;
+}
+
+// A value that is read from memory once, where compilers would read it again for each of its uses.
+inline Vector kept_in_register(Vector x) {
+#if defined(__AVX512F__)
+  asm("" : "+v"(x));
+#elif defined(__AVX__)
+  asm("" : "+x"(x));
+#endif
+  return x;
 }
 
 inline void store(Vector x, float* to) { std::memcpy(to, &x, sizeof(x)); }
