@@ -63,7 +63,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("project", "_to_pixels(camera, xyz", "_to_pixels(ideal(camera), xyz"),
         ("unproject", "undistort(camera, uv)", "uv"),
         ("unproject", "depth[..., None]", "depth[..., None].abs()"),
-        ("rays", "unproject(camera, uv", "unproject(camera, distort(camera, uv)"),
+        ("_rays", "Camera(f, c, distortion), uv,", "Camera(f, c, distortion), distort(Camera(f, c, distortion), uv),"),
         ("distort", "_to_pixels(camera, _normalised(camera, uv))", "undistort(camera, uv)"),
         ("undistort", "iterations=iterations", "iterations=5"),
         ("_undistort", "abs().amax(0)", "abs().amin(0)"),

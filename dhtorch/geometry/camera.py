@@ -191,7 +191,27 @@ def rays(camera: Camera, uv: Tensor) -> Tensor:
     By kornia's ``unproject_points`` at depth 1; a lens is undone before.
     """
     check("camera.rays", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
-    return unproject(camera, uv, torch.ones_like(uv[..., 0]))
+    if camera.distortion is not None:
+        _check_coefficient_count(camera.distortion)
+    return _rays(uv, camera.f, camera.c, camera.distortion)
+
+
+def _rays_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor | None) -> Tensor:
+    lens = uv.new_empty(0, 0) if distortion is None else distortion.contiguous()
+    ray = uv.new_empty(*uv.shape[:2], 3)
+    limits = NEWTON_STEPS, torch.finfo(uv.dtype).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT
+    torch.ops.dhtorch.rays.default(uv.contiguous(), f.contiguous(), c.contiguous(), lens, ray, *limits)
+    return ray
+
+
+#: What the kernels of this module read: pixels (B, N, 2), f and c (B, 2), distortion (B, k).
+_LENS_DTYPES = dict.fromkeys(("uv", "f", "c", "distortion"), torch.float32)
+
+
+@operator(kernel=_rays_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+def _rays(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor | None) -> Tensor:
+    """:func:`rays` of a camera's intrinsics."""
+    return unproject(Camera(f, c, distortion), uv, torch.ones_like(uv[..., 0]))
 
 
 def ray_heights(camera: Camera, uv: Tensor) -> Tensor:
@@ -232,10 +252,6 @@ def _undistort_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, i
     limits = torch.finfo(uv.dtype).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT
     torch.ops.dhtorch.undistort.default(uv.contiguous(), *lens, ideal_uv, iterations, *limits)
     return ideal_uv
-
-
-#: What the kernels of this module read: pixels (B, N, 2), f and c (B, 2), distortion (B, k).
-_LENS_DTYPES = dict.fromkeys(("uv", "f", "c", "distortion"), torch.float32)
 
 
 @operator(kernel=_undistort_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))

@@ -38,7 +38,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import (
     windows as neighbours,
 )
-from dhtorch.geometry.camera import Camera, from_matrix, project, undistort, undistort_jacobian, unproject
+from dhtorch.geometry.camera import Camera, from_matrix, project, rays, undistort, undistort_jacobian, unproject
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.map_estimate import estimate_noise_variance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
@@ -959,6 +959,9 @@ def test_pixels_of_a_lens_are_the_same_bits(loaded, monkeypatch, coefficients):
     found, expected = both_ways(lambda: undistort_jacobian(camera, uv[:, 4:]), monkeypatch)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
     assert [len(x) for x in asked] == [1, 1]
+    for seen_by in (camera, camera.replace(distortion=None)):
+        found, expected = both_ways(lambda lens=seen_by: rays(lens, uv), monkeypatch)
+        torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
     assert torch.equal(undistort(camera[1:], uv[1:]).nan_to_num(), undistort(camera, uv)[1:].nan_to_num())
     assert undistort(camera, uv.clone().requires_grad_()).requires_grad
     with pytest.raises(ValueError, match="7 coefficients"):

@@ -166,6 +166,30 @@ void undistort(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor ideal, i
   }
 }
 
+// The same pixels, distortion (B, k) or (0, 0) -> rays (B, N, 3), z = 1.
+void rays(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor ray, int64_t iterations, double eps, double tolerance_px,
+          double least) {
+  const int64_t B = uv.size(0), N = uv.size(1);
+  const Limits limits = {iterations, static_cast<float>(eps), static_cast<float>(tolerance_px)};
+  for (int64_t k = 0; k < B; ++k) {
+    const Camera camera(f, c, distortion, k, least);
+    for (int64_t n = 0; n < N; n += LANES) {
+      const int64_t some = std::min(LANES, N - n);
+      Vector u, v;
+      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
+      camera.undistort(u, v, limits, u, v);
+      u = (u - camera.c[0]) / camera.f[0];
+      v = (v - camera.c[1]) / camera.f[1];
+      float* to = data<float>(ray) + 3 * (N * k + n);
+      for (int64_t i = 0; i < some; ++i) {
+        to[3 * i] = u[i];
+        to[3 * i + 1] = v[i];
+        to[3 * i + 2] = 1.0f;
+      }
+    }
+  }
+}
+
 // Ideal pixels uv (B, N, 2), f and c (B, 2) px, distortion (B, k) float32 -> d(ideal) / d(distorted), J (B, N, 2, 2).
 void undistort_jacobian(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor J, double least) {
   const int64_t B = uv.size(0), N = uv.size(1);
@@ -246,6 +270,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "undistort(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor(a!) ideal, int iterations, float eps, "
       "float tolerance_px, float least) -> ()");
   m.def(
+      "rays(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor(a!) ray, int iterations, float eps, "
+      "float tolerance_px, float least) -> ()");
+  m.def(
       "undistort_tracks(Tensor uv_0, Tensor uv_1, Tensor cov, Tensor valid, Tensor f_0, Tensor c_0, Tensor distortion_0, "
       "Tensor f_1, Tensor c_1, Tensor distortion_1, Tensor(a!) ideal_0, Tensor(b!) ideal_1, Tensor(c!) ideal_cov, "
       "Tensor(d!) in_model, int iterations, float eps, float tolerance_px, float least) -> ()");
@@ -254,6 +281,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("undistort", TORCH_BOX(&undistort));
+  m.impl("rays", TORCH_BOX(&rays));
   m.impl("undistort_tracks", TORCH_BOX(&undistort_tracks));
   m.impl("undistort_jacobian", TORCH_BOX(&undistort_jacobian));
 }
