@@ -76,6 +76,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "ops.csrc.parallax": [
         ("Point", "t1 * a2) * of.stretch", "t1 * a2)"),
         ("triangulate", "p.gy * p.Y - p.py * p.Z;", "p.gx * p.Y - p.py * p.Z;"),
+        ("depth_variance", "2 * g0 * g1 * C[1]", "g0 * g1 * C[1]"),
+        ("depth_variance", "data<float>(cov_pose) + K * K * k", "data<float>(cov_pose)"),
         ("near_parallax", "off * off + shared", "off + shared"),
         ("near_parallax", "if (tracked && !returned)", "if (!returned)"),
         ("near_parallax", "turn[1] - turn[2] * along", "turn[1] + turn[2] * along"),

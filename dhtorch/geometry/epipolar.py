@@ -28,6 +28,11 @@ from dhtorch.ops.dispatch import operator
 MAX_CHUNK_TRIANGULATED = 1 << 15
 
 
+#: Least squared slope of a pixel by its depth, px²/m²: below it depth does not move the pixel.
+#: Source: origin not recorded.
+MIN_SQUARED_SLOPE = 1e-18
+
+
 class TwoView(NamedTuple):
     """Triangulation of B × N points: finite everywhere, meaningful where both depths are positive."""
 
@@ -201,13 +206,28 @@ def depth_variance(
 
     Gradient: to covariances and geometry. Infinite where depth does not move the pixel.
     """
-    slope = geometry.slope
+    return _depth_variance(geometry.slope, geometry.J_pose, cov_uv_1, cov_pose)
+
+
+def _depth_variance_kernel(slope: Tensor, J_pose: Tensor, cov_uv_1: Tensor, cov_pose: Tensor) -> tuple[Tensor, Tensor]:
+    own, shared = (slope.new_empty(slope.shape[:2]) for _ in range(2))
+    inputs = (x.contiguous() for x in (slope, J_pose, cov_uv_1, cov_pose))
+    torch.ops.dhtorch.depth_variance.default(*inputs, own, shared, MIN_SQUARED_SLOPE)
+    return own, shared
+
+
+_VARIANCE_DTYPES = dict.fromkeys(("slope", "J_pose", "cov_uv_1", "cov_pose"), torch.float32)
+
+
+@operator(kernel=_depth_variance_kernel, dtypes=_VARIANCE_DTYPES, any_layout=tuple(_VARIANCE_DTYPES))
+def _depth_variance(slope: Tensor, J_pose: Tensor, cov_uv_1: Tensor, cov_pose: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`depth_variance` of fields of a :class:`TwoView`."""
     slope2 = (slope * slope).sum(-1)
-    defined = slope2 > 1e-18
+    defined = slope2 > MIN_SQUARED_SLOPE
     gain = slope / torch.where(defined, slope2, torch.ones_like(slope2))[..., None]  # d(depth) / d(uv_1), m/px
     g0, g1 = gain.unbind(-1)
     own = quadratic_form(g0, g1, *upper_triangle(cov_uv_1))
-    row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, k)
+    row = g0[..., None] * J_pose[..., 0, :] + g1[..., None] * J_pose[..., 1, :]  # (B, N, k)
     cov_rows = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
     shared = (cov_rows * row).sum(-1)
     infinite = torch.full_like(own, torch.inf)

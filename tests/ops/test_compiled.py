@@ -998,6 +998,14 @@ def test_triangulated_tracks_agree_up_to_rounding(loaded, monkeypatch):
     for name, a, b in zip(expected._fields, found, expected, strict=True):
         assert a.shape == b.shape, name
         torch.testing.assert_close(a, b, rtol=2e-6, atol=2e-6, msg=lambda text, name=name: f"{name}: {text}")
+    geometry = expected._replace(slope=expected.slope.clone())
+    geometry.slope[0, 3] = 0.0
+    rows = torch.randn(3, 6, 9, generator=torch.Generator().manual_seed(2))
+    cov = tracks.cov + 0.1 * torch.rand(3, 301, 1, 1, generator=torch.Generator().manual_seed(3))
+    variances = both_ways(lambda: epipolar.depth_variance(geometry, cov, 1e-6 * rows @ rows.mT), monkeypatch)
+    for a, b in zip(*variances, strict=True):
+        assert torch.equal(a.isinf(), b.isinf()) and bool(a[0, 3].isinf())
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=0)
     leaf = tracks.uv_1.clone().requires_grad_()
     assert epipolar.triangulate(tracks.uv_0, leaf, camera, camera, T).depth.requires_grad
 

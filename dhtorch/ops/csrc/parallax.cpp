@@ -1,5 +1,5 @@
-// Triangulation of tracks, and the parallax of near returns. References: _triangulate in dhtorch/geometry/epipolar.py,
-// _near_parallax and _profile_cost in dhtorch/stages/misalignment.py; the same formulas in the same order, sums over tracks in another,
+// Triangulation of tracks with its variance, and the parallax of near returns. References: _triangulate and _depth_variance in
+// dhtorch/geometry/epipolar.py, _parallax and _profile_cost in dhtorch/stages/misalignment.py; the same formulas in the same order, sums over tracks in another,
 // angles by the C library. One thread, no gradient. The dispatch checks dtypes, Python the shapes.
 
 #include "vectors.h"
@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 namespace {
@@ -105,6 +106,34 @@ void triangulate(Tensor uv_0, Tensor uv_1, Tensor f_0, Tensor c_0, Tensor f_1, T
         dot[n] = p.X * d0 + p.Y * d1 + p.Z * d2;
       }
       for (int64_t n = 0; n < some; ++n) data<float>(parallax)[at + n] = std::atan2(cross[n], dot[n]);
+    }
+  }
+}
+
+// slope (B, N, 2), J (B, N, 2, K), cov (B, N, 2, 2) px^2, cov_pose (B, K, K), float32. Outputs: own and shared variance of
+// depth (B, N) m^2, infinite where the squared slope is at most `least`.
+void depth_variance(Tensor slope, Tensor J, Tensor cov, Tensor cov_pose, Tensor own, Tensor shared, double least) {
+  const int64_t B = slope.size(0), N = slope.size(1), K = cov_pose.size(1);
+  const float limit = static_cast<float>(least), infinite = std::numeric_limits<float>::infinity();
+  std::vector<float> row(K);
+  for (int64_t k = 0; k < B; ++k) {
+    const float* pose = data<float>(cov_pose) + K * K * k;
+    for (int64_t n = N * k; n < N * (k + 1); ++n) {
+      const float *s = data<float>(slope) + 2 * n, *C = data<float>(cov) + 4 * n, *by = data<float>(J) + 2 * K * n;
+      const float square = s[0] * s[0] + s[1] * s[1], g0 = s[0] / square, g1 = s[1] / square;
+      if (!(square > limit)) {
+        data<float>(own)[n] = data<float>(shared)[n] = infinite;
+        continue;
+      }
+      data<float>(own)[n] = g0 * g0 * C[0] + 2 * g0 * g1 * C[1] + g1 * g1 * C[3];
+      for (int64_t i = 0; i < K; ++i) row[i] = g0 * by[i] + g1 * by[K + i];
+      float total = 0;
+      for (int64_t j = 0; j < K; ++j) {
+        float carried = 0;
+        for (int64_t i = 0; i < K; ++i) carried += row[i] * pose[K * i + j];
+        total += carried * row[j];
+      }
+      data<float>(shared)[n] = total < 0 ? 0 : total;
     }
   }
 }
@@ -238,6 +267,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "Tensor(a!) depth, Tensor(b!) depth_1, Tensor(c!) parallax, Tensor(d!) residual, Tensor(e!) slope, "
       "Tensor(f!) J_pose) -> ()");
   m.def(
+      "depth_variance(Tensor slope, Tensor J, Tensor cov, Tensor cov_pose, Tensor(a!) own, Tensor(b!) shared, float least) "
+      "-> ()");
+  m.def(
       "near_parallax(Tensor uv_0, Tensor uv_1, Tensor valid, Tensor xyz, Tensor sigma, Tensor posed, Tensor R, Tensor t, "
       "Tensor rate, Tensor f_0, Tensor c_0, Tensor f_1, Tensor c_1, Tensor(a!) uv, Tensor(b!) p, Tensor(c!) q, "
       "Tensor(d!) a, Tensor(e!) variance_rel, Tensor(f!) noise, Tensor(g!) used, float tolerance_rel, "
@@ -249,6 +281,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("triangulate", TORCH_BOX(&triangulate));
+  m.impl("depth_variance", TORCH_BOX(&depth_variance));
   m.impl("near_parallax", TORCH_BOX(&near_parallax));
   m.impl("profile_cost", TORCH_BOX(&profile_cost));
 }
