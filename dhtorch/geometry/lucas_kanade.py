@@ -11,7 +11,7 @@ C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is compute
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same search without maps, one point at a time: ``search`` of ``tests/support/reference.py``. One level of the search
+The same search without maps, one point at a time: ``search`` of ``tests/support/reference.py``. The whole search
 has a compiled kernel.
 """
 
@@ -30,7 +30,7 @@ from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, ch
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE
 from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import can_dispatch, operator
 
 #: Width of a cell, px of its level: on coarse levels, which only provide the start of the next one, the points of a
 #: cell share one search. Cells are nested, so that they share its start as well. Source: origin not recorded.
@@ -80,6 +80,16 @@ class SearchOptions(NamedTuple):
     normalise: str
 
 
+class _Views(NamedTuple):
+    """Two pyramids and the options of a search; see :func:`search_displacements`."""
+
+    source: Pyramid
+    target: Pyramid
+    o: SearchOptions
+    near_levels: int
+    alike: bool
+
+
 class _Pair(NamedTuple):
     """One level of two pyramids, the options of its search, and the bounds of its points."""
 
@@ -126,7 +136,74 @@ def search_displacements(
     Coarse to fine. ``alike``: all ``d`` are equal, so that the points of a cell may share a search. ``begun``: points
     whose ``d`` is within the range of the finest ``near_levels`` levels; they skip the coarser ones.
     """
-    x, d = x.contiguous(), d.contiguous()
+    views = _Views(source, target, o, near_levels, alike)
+    return _search(x.contiguous(), d.contiguous(), batch, known, begun, views=views)
+
+
+def _search_kernel(
+    x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor, *, views: _Views
+) -> tuple[Tensor, Tensor, Tensor]:
+    source, target, o = views.source, views.target, views.o
+    displacement, A, valid = torch.empty_like(d), d.new_empty(3, d.shape[-1]), torch.empty_like(known)
+    torch.ops.dhtorch.lk_search.default(
+        source=source.levels,
+        target=target.levels,
+        x=x,
+        d=d,
+        batch=batch,
+        known=known,
+        begun=begun,
+        found=displacement,
+        A=A,
+        valid=valid,
+        top_radii=TOP_RADII,
+        middle_radii=MIDDLE_RADII,
+        finest_radii=FINEST_RADII,
+        near_levels=views.near_levels,
+        alike=views.alike,
+        cell_px=CELL_PX,
+        cell_level=CELL_LEVEL,
+        window=o.window,
+        iterations=o.iterations,
+        steps_per_map=STEPS_PER_MAP,
+        pad=source.pad,
+        margin=OUTSIDE_MARGIN_PX,
+        remove_bias=o.normalise != "none",
+        estimate_gain=o.normalise == "gain_bias",
+        epsilon=o.epsilon_px,
+        coarse_epsilon=o.epsilon_px * COARSE_EPSILON_FACTOR,
+        min_eigenvalue=o.min_eigenvalue,
+        min_gain=CONTRAST_RATIO_RANGE[0],
+        max_gain=CONTRAST_RATIO_RANGE[1],
+        aitken_step=AITKEN_STEP,
+        min_ratio=AITKEN_RATIO_RANGE[0],
+        max_ratio=AITKEN_RATIO_RANGE[1],
+    )
+    return displacement, valid, A
+
+
+def _reads_plain_levels(*_: Tensor, views: _Views) -> bool:
+    """Whether a kernel may read the levels of both pyramids."""
+    levels = (*views.source.levels, *views.target.levels)
+    return can_dispatch(levels, (((torch.float32,), False),) * len(levels))
+
+
+@operator(
+    kernel=_search_kernel,
+    dtypes={
+        "x": torch.float32,
+        "d": torch.float32,
+        "batch": torch.int64,
+        "known": torch.bool,
+        "begun": torch.bool,
+    },
+    when=_reads_plain_levels,
+)
+def _search(
+    x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor, *, views: _Views
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`search_displacements` of contiguous points."""
+    source, target, o, near_levels, alike = views
     top = min(len(source.levels), len(target.levels)) - 1
     coarse_options = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON_FACTOR)
 
@@ -338,72 +415,6 @@ def _search_level(
 
     All points are searched on a first map, those that have not converged on further ones. A is (3, M).
     """
-    levels = pair.source.levels[pair.level], pair.target.levels[pair.level]
-    return _lk_level(*levels, x, d, batch, known, pair=pair, radii=radii)
-
-
-def _lk_level_kernel(
-    source: Tensor,
-    target: Tensor,
-    x: Tensor,
-    d: Tensor,
-    batch: Tensor,
-    known: Tensor,
-    *,
-    pair: _Pair,
-    radii: tuple[int, ...],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    o = pair.o
-    displacement, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
-    on_map, textured = torch.empty_like(known), torch.empty_like(known)
-    torch.ops.dhtorch.lk_level.default(
-        source=source,
-        target=target,
-        x=x,
-        d=d,
-        batch=batch,
-        known=known,
-        limits=torch.cat([pair.low, pair.high], 1).T.contiguous(),
-        radii=torch.tensor(radii),
-        found=displacement,
-        A=A,
-        held=on_map,
-        textured=textured,
-        window=o.window,
-        iterations=o.iterations,
-        steps_per_map=STEPS_PER_MAP,
-        pad=pair.source.pad,
-        margin=OUTSIDE_MARGIN_PX,
-        remove_bias=o.normalise != "none",
-        estimate_gain=o.normalise == "gain_bias",
-        epsilon=o.epsilon_px,
-        min_eigenvalue=o.min_eigenvalue,
-        min_gain=CONTRAST_RATIO_RANGE[0],
-        max_gain=CONTRAST_RATIO_RANGE[1],
-        finest=pair.level == 0,
-        aitken_step=AITKEN_STEP,
-        min_ratio=AITKEN_RATIO_RANGE[0],
-        max_ratio=AITKEN_RATIO_RANGE[1],
-    )
-    return displacement, on_map, textured, A
-
-
-@operator(
-    kernel=_lk_level_kernel,
-    dtypes=dict.fromkeys(("source", "target", "x", "d"), torch.float32) | {"batch": torch.int64, "known": torch.bool},
-)
-def _lk_level(
-    source: Tensor,
-    target: Tensor,
-    x: Tensor,
-    d: Tensor,
-    batch: Tensor,
-    known: Tensor,
-    *,
-    pair: _Pair,
-    radii: tuple[int, ...],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """:func:`_search_level` on the level tensors ``source`` and ``target`` of ``pair``."""
     o = pair.o
     corner = pair.target.corner(pair.level, x + d) - radii[0]
     C, moments = _correlation_map(pair, radii[0], x, corner, batch)

@@ -1090,7 +1090,7 @@ def test_a_search_in_another_type_or_with_a_graph_is_torchs(loaded, monkeypatch,
     here, there, uv = seen_twice
     found, expected = both_ways(lambda: lucas_kanade(here.double(), there.double(), uv.double()), monkeypatch)
     assert torch.equal(found.uv_1, expected.uv_1)
-    calls = counted(monkeypatch, "lk_level")
+    calls = counted(monkeypatch, "lk_search")
     lucas_kanade(here.double(), there.double(), uv.double())
     assert not calls
     lucas_kanade(here, there, uv)

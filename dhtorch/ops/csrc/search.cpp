@@ -1,6 +1,6 @@
-// One level of the Lucas-Kanade search, one point after another. Reference: _lk_level in
-// dhtorch/geometry/lucas_kanade.py; the same maps, steps and criteria. Sums over a window are taken in another order, so
-// that displacements agree up to rounding; a point's result does not depend on the others. One thread, no gradient. The
+// The Lucas-Kanade search from coarse to fine, one point after another on each level. Reference: search_displacements in
+// dhtorch/geometry/lucas_kanade.py; the same cells, maps, steps and criteria. Sums over a window are taken in another order,
+// so that displacements agree up to rounding; a point's result does not depend on the others. One thread, no gradient. The
 // dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
@@ -18,7 +18,7 @@ static_assert(MAX_NODES * MAX_NODES <= 64);               // one bit each
 
 struct Level {
   const float* pixels;
-  int64_t planes, rows, width, pad, margin;
+  int64_t planes, rows, width, pad, margin;  // margin: pixels outside the image where a point may be
 
   Level(const Tensor& x, int64_t pad, int64_t margin)
       : pixels(data<float>(x)), planes(x.size(1)), rows(x.size(2)), width(x.size(3)), pad(pad), margin(margin) {}
@@ -438,48 +438,166 @@ void search_point(const Window& window, const float* inverse, Target& target, in
   }
 }
 
-// source (B, 3, ., .), target (B, 1 or 3, ., .), x and d (2, M), limits (2, 2): lowest and highest position, float32; batch
-// (M) and radii of the maps, at most MAX_MAP_RADIUS_PX, int64; known (M) bool: points to search for. Outputs: found (2, M)
-// displacement and A (3, M) float32, held on the last map and textured (M) bool. `finest`: the level is read between
-// pixels, and one step extrapolates.
-void lk_level(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, Tensor radii,
-              Tensor found, Tensor A, Tensor held, Tensor textured, int64_t window, int64_t iterations,
-              int64_t steps_per_map, int64_t pad, int64_t margin, bool remove_bias, bool estimate_gain, double epsilon,
-              double min_eigenvalue, double min_gain, double max_gain, bool finest, int64_t aitken_step, double min_ratio,
-              double max_ratio) {
-  const Level here(source, pad, margin);
-  Options o{iterations, steps_per_map, static_cast<float>(epsilon), min_eigenvalue * static_cast<double>(window * window),
-            static_cast<float>(min_gain), static_cast<float>(max_gain), finest, aitken_step,
-            static_cast<float>(min_ratio), static_cast<float>(max_ratio), {}, {}};
-  std::copy_n(data<float>(limits), 2, o.low);
-  std::copy_n(data<float>(limits) + 2, 2, o.high);
-  const int64_t M = x.size(1), maps = radii.size(0);
-  const float *places = data<float>(x), *begins = data<float>(d);
-  const int64_t *pairs = data<int64_t>(batch), *reach = data<int64_t>(radii);
-  const bool* wanted = data<bool>(known);
-  float *to = data<float>(found), *normal = data<float>(A);
-  bool *on_last = data<bool>(held), *with_texture = data<bool>(textured);
-  Window own(window);
-  Target there(Level(target, pad, margin), target.size(0), M, own);
-  for (int64_t m = 0; m < M; ++m) {
-    const float place[2] = {places[m], places[M + m]};
-    const int64_t b = pairs[m];
-    State s{{begins[m], begins[M + m]}, wanted[m], false};
-    finest ? own.read<true>(here, place[0], place[1], b) : own.read<false>(here, place[0], place[1], b);
-    own.project(remove_bias, estimate_gain);
-    float inverse[3];
-    const bool fine = invert(own.moments + 2, o.min_eigenvalue, inverse);
-    const float begun[2] = {place[0] + s.d[0], place[1] + s.d[1]};
-    s.live = s.live && fine && o.within(begun);
-    if (estimate_gain) {
-      search_point<3>(own, inverse, there, b, place, reach, maps, o, s);
-    } else {
-      search_point<2>(own, inverse, there, b, place, reach, maps, o, s);
+// A point and its displacement, px of a level, its image, and what the search on a level says of it.
+struct Point {
+  float x[2], d[2];
+  int64_t batch;
+  bool known, held, textured;
+  float A[3];
+};
+
+struct Search {
+  std::vector<Level> source, target;
+  int64_t window, images;
+  bool remove_bias, estimate_gain;
+  Options finest, coarse;
+  std::vector<int64_t> top_radii, middle_radii, finest_radii;
+  int64_t near_levels, cell_px, cell_level;  // cell_level: the finest one with cells
+  float scale(int64_t level) const { return std::ldexp(1.0f, static_cast<int>(-level)); }
+  int64_t top() const { return static_cast<int64_t>(std::min(source.size(), target.size())) - 1; }
+
+  // Height (axis 1) or width of an image.
+  int64_t size(const Level& level, int axis) const { return (axis ? level.rows : level.width) - 2 * level.pad; }
+
+  // Search on one level, from and to displacements there.
+  template <bool exactly>
+  void on_level(int64_t level, std::vector<Point>& points, const std::vector<int64_t>& radii, Options o) const {
+    for (int axis = 0; axis < 2; ++axis) {
+      const float margin = level ? static_cast<float>(target[0].margin) : 0.0f;
+      o.low[axis] = -0.5f * scale(level) - margin;
+      o.high[axis] = (static_cast<float>(size(target[0], axis)) - 0.5f) * scale(level) + margin;
     }
-    for (int axis = 0; axis < 2; ++axis) to[axis * M + m] = s.d[axis];
-    for (int k = 0; k < 3; ++k) normal[k * M + m] = own.moments[2 + k];
-    on_last[m] = s.held;
-    with_texture[m] = fine;
+    const int64_t maps = static_cast<int64_t>(radii.size());
+    Window own(window);
+    Target there(target[level], images, static_cast<int64_t>(points.size()), own);
+    for (Point& point : points) {
+      State s{{point.d[0], point.d[1]}, point.known, false};
+      own.read<exactly>(source[level], point.x[0], point.x[1], point.batch);
+      own.project(remove_bias, estimate_gain);
+      float inverse[3];
+      point.textured = invert(own.moments + 2, o.min_eigenvalue, inverse);
+      const float begun[2] = {point.x[0] + s.d[0], point.x[1] + s.d[1]};
+      s.live = s.live && point.textured && o.within(begun);
+      if (estimate_gain) {
+        search_point<3>(own, inverse, there, point.batch, point.x, radii.data(), maps, o, s);
+      } else {
+        search_point<2>(own, inverse, there, point.batch, point.x, radii.data(), maps, o, s);
+      }
+      std::copy_n(s.d, 2, point.d);
+      std::copy_n(own.moments + 2, 3, point.A);
+      point.held = s.held;
+    }
+    if (exactly) {
+      for (Point& point : points) {
+        const float end[2] = {point.x[0] + point.d[0], point.x[1] + point.d[1]};
+        point.held = point.held && o.within(end);
+      }
+    }
+  }
+
+  // Displacements (px of the finest level) -> those on `level` that the coarser levels lead to. Points that have `begun`
+  // skip the levels that are not near.
+  void start(int64_t level, std::vector<Point>& points, const bool* begun, bool alike) const {
+    if (level < top() && begun && level + 1 >= near_levels) {
+      std::vector<Point> cold;
+      for (size_t i = 0; i < points.size(); ++i) {
+        if (!begun[i]) cold.push_back(points[i]);
+      }
+      start(level, cold, nullptr, alike);
+      for (size_t i = 0, k = 0; i < points.size(); ++i) {
+        for (int axis = 0; axis < 2; ++axis) points[i].d[axis] = begun[i] ? points[i].d[axis] * scale(level) : cold[k].d[axis];
+        k += !begun[i];
+      }
+      return;
+    }
+    if (level == top()) {
+      for (Point& point : points) {
+        for (float& d : point.d) d *= scale(level);
+      }
+    } else if (alike && level + 1 >= cell_level) {
+      by_cell(level + 1, points);
+    } else {
+      coarser(level + 1, points, begun, alike);
+    }
+  }
+
+  // The displacement on `level`, twice as long.
+  void coarser(int64_t level, std::vector<Point>& points, const bool* begun, bool alike) const {
+    std::vector<Point> here = points;
+    start(level, here, begun, alike);
+    for (Point& point : here) {  // interpolated on the finest level only
+      for (int axis = 0; axis < 2; ++axis) point.x[axis] = source[level].corner(point.x[axis] * scale(level) + 0.5f, axis);
+      point.known = true;
+    }
+    on_level<false>(level, here, level == top() || level + 1 == near_levels ? top_radii : middle_radii, coarse);
+    for (size_t i = 0; i < points.size(); ++i) {
+      for (int axis = 0; axis < 2; ++axis) points[i].d[axis] = here[i].d[axis] * 2.0f;
+    }
+  }
+
+  // The same at the centre of each point's cell; all points have the same displacement.
+  void by_cell(int64_t level, std::vector<Point>& points) const {
+    const int64_t side = cell_px << level, columns = (size(source[0], 0) + side - 1) / side, rows = (size(source[0], 1) + side - 1) / side;
+    const float across = static_cast<float>(side);
+    std::vector<int64_t> index(images * rows * columns, -1), of;
+    std::vector<Point> cells;
+    for (const Point& point : points) {
+      int64_t cell[2];
+      for (int axis = 0; axis < 2; ++axis) {
+        cell[axis] = std::clamp<int64_t>(static_cast<int64_t>((point.x[axis] + 0.5f) / across), 0, (axis ? rows : columns) - 1);
+      }
+      int64_t& place = index[(point.batch * rows + cell[1]) * columns + cell[0]];
+      if (place < 0) {
+        place = static_cast<int64_t>(cells.size());
+        Point centre = point;
+        for (int axis = 0; axis < 2; ++axis) {
+          centre.x[axis] = std::min((static_cast<float>(cell[axis]) + 0.5f) * across, static_cast<float>(size(source[0], axis)) - 1.0f);
+        }
+        cells.push_back(centre);
+      }
+      of.push_back(place);
+    }
+    coarser(level, cells, nullptr, true);
+    for (size_t i = 0; i < points.size(); ++i) std::copy_n(cells[of[i]].d, 2, points[i].d);
+  }
+};
+
+// source (B, 3, ., .) and target (B, 1 or 3, ., .): levels, finest first; x and d (2, M) px of the finest, float32; batch (M)
+// int64; known and begun (M) bool: points to search for, and those that skip the levels from `near_levels` on. Radii of the
+// maps, at most MAX_MAP_RADIUS_PX. Outputs: found (2, M) displacement and A (3, M) float32, valid (M) bool.
+void lk_search(std::vector<Tensor> source, std::vector<Tensor> target, Tensor x, Tensor d, Tensor batch, Tensor known,
+               Tensor begun, Tensor found, Tensor A, Tensor valid, std::vector<int64_t> top_radii,
+               std::vector<int64_t> middle_radii, std::vector<int64_t> finest_radii, int64_t near_levels, bool alike,
+               int64_t cell_px, int64_t cell_level, int64_t window, int64_t iterations, int64_t steps_per_map, int64_t pad,
+               int64_t margin, bool remove_bias, bool estimate_gain, double epsilon, double coarse_epsilon,
+               double min_eigenvalue, double min_gain, double max_gain, int64_t aitken_step, double min_ratio,
+               double max_ratio) {
+  const Options finest{iterations, steps_per_map, static_cast<float>(epsilon), min_eigenvalue * static_cast<double>(window * window),
+                       static_cast<float>(min_gain), static_cast<float>(max_gain), true, aitken_step,
+                       static_cast<float>(min_ratio), static_cast<float>(max_ratio), {}, {}};
+  Options coarse = finest;
+  coarse.epsilon = static_cast<float>(coarse_epsilon);
+  coarse.extrapolate = false;
+  Search search{{}, {}, window, source[0].size(0), remove_bias, estimate_gain, finest, coarse, top_radii, middle_radii,
+                finest_radii, near_levels, cell_px, cell_level};
+  for (const Tensor& level : source) search.source.emplace_back(level, pad, margin);
+  for (const Tensor& level : target) search.target.emplace_back(level, pad, margin);
+  const int64_t M = x.size(1);
+  const float *places = data<float>(x), *starts = data<float>(d);
+  const int64_t* pairs = data<int64_t>(batch);
+  const bool* wanted = data<bool>(known);
+  std::vector<Point> points(M);
+  for (int64_t m = 0; m < M; ++m) {
+    points[m] = {{places[m], places[M + m]}, {starts[m], starts[M + m]}, pairs[m], wanted[m], false, false, {}};
+  }
+  search.start(0, points, data<bool>(begun), alike);
+  search.on_level<true>(0, points, search.top() ? finest_radii : top_radii, finest);
+  float *to = data<float>(found), *normal = data<float>(A);
+  bool* good = data<bool>(valid);
+  for (int64_t m = 0; m < M; ++m) {
+    for (int axis = 0; axis < 2; ++axis) to[axis * M + m] = points[m].d[axis];
+    for (int k = 0; k < 3; ++k) normal[k * M + m] = points[m].A[k];
+    good[m] = points[m].known && points[m].textured && points[m].held;
   }
 }
 
@@ -547,17 +665,17 @@ void window_differences(Tensor source, Tensor target, Tensor x, Tensor y, Tensor
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
-      "lk_level(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, "
-      "Tensor radii, Tensor(a!) found, Tensor(b!) A, Tensor(c!) held, Tensor(d!) textured, int window, int iterations, "
-      "int steps_per_map, int pad, int margin, bool remove_bias, bool estimate_gain, float epsilon, "
-      "float min_eigenvalue, float min_gain, float max_gain, bool finest, int aitken_step, float min_ratio, "
-      "float max_ratio) -> ()");
+      "lk_search(Tensor[] source, Tensor[] target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor begun, "
+      "Tensor(a!) found, Tensor(b!) A, Tensor(c!) valid, int[] top_radii, int[] middle_radii, int[] finest_radii, "
+      "int near_levels, bool alike, int cell_px, int cell_level, int window, int iterations, int steps_per_map, int pad, "
+      "int margin, bool remove_bias, bool estimate_gain, float epsilon, float coarse_epsilon, float min_eigenvalue, "
+      "float min_gain, float max_gain, int aitken_step, float min_ratio, float max_ratio) -> ()");
   m.def(
       "window_differences(Tensor source, Tensor target, Tensor x, Tensor y, Tensor batch, Tensor(a!) sums, int window, int pad, "
       "int margin, bool remove_bias, bool estimate_gain, float min_gain, float max_gain) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("lk_level", TORCH_BOX(&lk_level));
+  m.impl("lk_search", TORCH_BOX(&lk_search));
   m.impl("window_differences", TORCH_BOX(&window_differences));
 }
