@@ -55,8 +55,8 @@ def test_every_layout_is_read_back(tmp_path: Path, layout: str) -> None:
 
 
 def test_pictures_of_numbers_become_bytes() -> None:
-    numbers = np.array([[[0.0], [0.2], [0.5], [1.0], [1.5], [-0.1], [np.nan]]])
-    assert simulator_hdf5._to_bytes(numbers).ravel().tolist() == [0, 51, 128, 255, 255, 0, 0]
+    numbers = np.array([[[0.0], [0.2], [0.75], [1.0], [1.5], [-0.1], [np.nan]]])
+    assert simulator_hdf5._to_bytes(numbers).ravel().tolist() == [0, 51, 191, 255, 255, 0, 0]
 
 
 def test_one_pose_source_suffices(tmp_path: Path) -> None:
