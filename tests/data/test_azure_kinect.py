@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import pickle
@@ -56,6 +57,13 @@ def test_both_tracks_are_read(tmp_path: Path, codec: str, names: tuple[str, str]
         torch.testing.assert_close(got.camera.f, CAMERA.f)
         assert float((got.image.float() - want.image.float()).abs().mean()) < 5
         torch.testing.assert_close(got.time, want.time - 100, atol=1e-3, rtol=0)
+
+
+def test_a_cluster_of_unknown_length_ends_what_is_read() -> None:
+    info, cluster = b"\x15\x49\xa9\x66\x82ab", b"\x1f\x43\xb6\x75\xff" + bytes(9)
+    content = info + cluster
+    (found,) = matroska._iter_elements(io.BytesIO(content), 0, len(content))
+    assert (found.start, found.end) == (5, 7)
 
 
 def test_depth_is_registered_by_the_factorys_calibration(tmp_path: Path) -> None:

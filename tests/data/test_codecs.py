@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import random
@@ -14,6 +15,7 @@ import pytest
 
 from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.codecs import lzfse as codec_lzfse
+from dhtorch.data.codecs import mp4 as codec_mp4
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
@@ -109,6 +111,26 @@ def test_exr_chunks_lie_inside_the_file(tmp_path: Path) -> None:
         file.write_bytes(bytes(whole))
         with pytest.raises(FormatError, match=r"d.exr: chunk 1: found bytes beyond the \d+ of the file"):
             codec_exr.read_exr(file)
+
+
+def test_exr_chunks_do_not_begin_in_their_table(tmp_path: Path) -> None:
+    file = exr(tmp_path / "d.exr", {"R": np.ones((40, 6), np.float32)})
+    header, data = codec_exr.read_exr_header(file), bytearray(file.read_bytes())
+    struct.pack_into("<Q", data, header.start + 8, header.start + 8 * header.chunks - 8)
+    with pytest.raises(FormatError, match="chunk 1: found bytes beyond"):
+        codec_exr._check_chunks(header, bytes(data), file)
+
+
+def boxes(kind: bytes, *content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(b"".join(content)), kind) + b"".join(content)
+
+
+def test_a_track_without_a_display_matrix_is_not_turned_by_the_next_ones() -> None:
+    video = boxes(b"mdia", boxes(b"hdlr", bytes(8) + b"vide"))
+    turned = boxes(b"tkhd", bytes(40) + struct.pack(">5i", 0, 65536, 0, -65536, 0))
+    stream = io.BytesIO(boxes(b"moov", boxes(b"trak", video), boxes(b"trak", turned, video)))
+    found = [codec_mp4.read_display_symmetry(stream, track) for track in range(3)]
+    assert found == [0, codec_mp4.SYMMETRY_OF_MATRIX[(0, 1, -1, 0)], 0] and found[1] > 0
 
 
 def test_exr_chooses_its_channel(tmp_path: Path) -> None:
