@@ -182,7 +182,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("decode_compressed_depth", "np.float32(a) / (code - np.float32(b))", "np.float32(a) / (code + np.float32(b))"),
         ("decode_depth", "to_metres(pixels, 1 / metres)", "to_metres(pixels, metres)"),
         ("_brown_conrady_terms", "r2 + 2 * x * x", "r2 + x * x"),
-        ("_invert_brown_conrady", "(u - info.K[0, 2]) / info.K[0, 0]", "(u - info.K[0, 2]) / info.K[1, 1]"),
+        ("_invert_brown_conrady", "distorted - ideal", "ideal - distorted"),
     ],
     "data.codecs.ros_messages": [
         ("_Cursor.number", "self.at += -self.at % size", "pass"),

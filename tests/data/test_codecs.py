@@ -9,6 +9,7 @@ import random
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -131,6 +132,23 @@ def test_a_track_without_a_display_matrix_is_not_turned_by_the_next_ones() -> No
     stream = io.BytesIO(boxes(b"moov", boxes(b"trak", video), boxes(b"trak", turned, video)))
     found = [codec_mp4.read_display_symmetry(stream, track) for track in range(3)]
     assert found == [0, codec_mp4.SYMMETRY_OF_MATRIX[(0, 1, -1, 0)], 0] and found[1] > 0
+
+
+def test_samples_of_a_table_of_runs_are_counted() -> None:
+    stream = io.BytesIO(boxes(b"stts", bytes(4), struct.pack(">5I", 2, 3, 1, 4, 1)))
+    (box,) = codec_mp4._iter_boxes(stream, codec_mp4._Box(b"", 0, len(stream.getvalue())), 0)
+    assert codec_mp4._declared_samples(stream, box, Path("a.mp4")) == 7
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [("u1", 8), ("<u2", 12)])
+def test_rows_of_a_plane_may_be_padded(dtype: str, bits: int) -> None:
+    class Plane(bytes):
+        line_size = 4 * np.dtype(dtype).itemsize
+
+    rows = np.arange(8, dtype=dtype).reshape(2, 4)
+    form = SimpleNamespace(components=[SimpleNamespace(bits=bits)])
+    frame = SimpleNamespace(planes=[Plane(rows.tobytes())], format=form, height=2, width=3)
+    np.testing.assert_array_equal(codec_video._extract_luma(frame), rows[:, :3])
 
 
 def test_exr_chooses_its_channel(tmp_path: Path) -> None:

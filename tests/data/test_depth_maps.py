@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io.decode import FormatError
 from dhtorch.export.frames import encode_png
@@ -151,6 +152,11 @@ def npy_claiming(shape, data=b""):
 
 def pfm_of(scale, values):
     return f"Pf\n{values.shape[1]} {values.shape[0]}\n{scale}\n".encode() + values.astype("<f4").tobytes()
+
+
+def test_the_last_row_of_a_pfm_comes_first(tmp_path):
+    (tmp_path / "a.pfm").write_bytes(pfm_of("-1", np.array([[3.0, 4], [1, 2]])))
+    assert read_pfm(tmp_path / "a.pfm").tolist() == [[1, 2], [3, 4]]
 
 
 def npz_with(*members):

@@ -70,6 +70,11 @@ def test_unregistered_depth_is_reprojected_or_kept(tmp_path: Path) -> None:
     assert float(wrong) > 0.015  # so the check above can tell
 
 
+def test_K_of_another_size_keeps_pixel_centres() -> None:
+    K = convert.resize_K(np.array([[60.0, 0, 30], [0, 50, 20], [0, 0, 1]]), (40, 60), (80, 30))
+    assert K.tolist() == [[30, 0, 14.75], [0, 100, 40.5], [0, 0, 1]]
+
+
 def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
     cams = [Camera(torch.tensor([[60.0, 60.0]]), torch.tensor([[c, 22.25]])) for c in (30.25, 33.5)]
     away = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.125, 0, 0]], dtype=torch.float64))

@@ -12,7 +12,7 @@ import torch
 from support.box_scene import disagreement, off_wall, own_camera, render, walk, world_points
 
 from dhtorch import data
-from dhtorch.data.codecs import ros_images
+from dhtorch.data.codecs import ros_images, rosbag1
 from dhtorch.data.codecs.ros_messages import CameraInfo, Header, RawImage
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.units import DepthUnit
@@ -63,6 +63,13 @@ def test_every_storage_is_read_back(tmp_path: Path, name: str) -> None:
     for part in [] if name.endswith(".bag") else tmp_path.glob(f"{name}/*.[md][cb]*"):
         same_frames(data.open(part), frames)  # a file of the folder alone
     same_frames(pickle.loads(pickle.dumps(recording)), frames)
+
+
+def test_messages_have_the_times_at_which_they_were_recorded(tmp_path: Path) -> None:
+    frames = walk(2)
+    write_rosbag(tmp_path / "a.bag", frames, BagLayout("ros1"))
+    times = {message.time_ns for message in rosbag1.iter_bag_messages(tmp_path / "a.bag")}
+    assert {round(1e9 * float(frame.time)) for frame in frames} <= times
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
@@ -322,10 +329,10 @@ def test_lens_models() -> None:
 
 def test_an_inverse_lens_model_is_inverted() -> None:
     """Ideal coordinates by the stated polynomial are those that the returned lens maps back to the pixel."""
-    D = (-0.05, 0.03, 0.0005, -0.0007, -0.01)
-    stated = info("Inverse Brown Conrady", D)
+    D = (-0.05, 0.03, 0.0015, -0.002, -0.01)
+    stated = info("Inverse Brown Conrady", D, np.array([[600.0, 0, 320], [0, 540, 240], [0, 0, 1]]))
     wanted = ros_images.to_opencv_distortion(stated, Path("a"))
-    camera = Camera(torch.tensor([[600.0, 600]]), torch.tensor([[320.0, 240]]), torch.tensor([wanted]))
+    camera = Camera(torch.tensor([[600.0, 540]]), torch.tensor([[320.0, 240]]), torch.tensor([wanted]))
     uv = torch.tensor([[[0.0, 0], [639, 0], [320, 479], [100, 333]]])
     x, y = ((uv[0] - camera.c) / camera.f).T
     r2 = x * x + y * y
