@@ -52,6 +52,17 @@ def test_the_stored_orientation_of_sound_captures_wins(capture: str) -> None:
     assert orientation.select_symmetry(frames)[0] in (0, None)
 
 
+def test_edges_correlate_whatever_their_mean_and_scale_are() -> None:
+    a = 1 + torch.rand(3, 6, 8, generator=torch.manual_seed(0))
+    assert orientation.edge_correlation(a, 2 * a + 3, torch.ones(6, 8, dtype=torch.bool)) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("k", range(8))
+def test_a_symmetry_is_undone_by_its_inverse(k: int) -> None:
+    x = torch.arange(12.0).view(1, 3, 4)
+    assert torch.equal(orientation.apply_symmetry(orientation.apply_symmetry(x, k), orientation._inverse(k)), x)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("k", range(8))
 def test_the_symmetry_that_undoes_a_planted_one_is_selected(k: int) -> None:

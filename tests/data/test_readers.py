@@ -75,6 +75,23 @@ def test_K_of_another_size_keeps_pixel_centres() -> None:
     assert K.tolist() == [[30, 0, 14.75], [0, 100, 40.5], [0, 0, 1]]
 
 
+@pytest.mark.parametrize("turns", [-1, 0, 1, 2, 3])
+def test_picture_camera_and_pose_turn_together(turns: int) -> None:
+    """The pixel of a turned picture that a point is seen at has the value of its pixel before."""
+    lens = torch.tensor([[0.05, -0.02, 0.004, -0.006]])
+    camera = Camera(torch.tensor([[30.0, 33.0]]), torch.tensor([[14.0, 9.0]]), lens)
+    image, uv = torch.arange(20 * 28).view(20, 28), torch.tensor([[[5.0, 3.0], [22.0, 16.0], [9.0, 12.0]]])
+    T = pose(1)
+    xyz = se3.apply(T, cameras.unproject(camera, uv, torch.full((1, 3), 2.0)).double())
+    c2w = torch.from_numpy(convert.rot90_pose(se3.to_matrix(T).numpy(), turns))
+    turned = convert.rot90_camera(camera, (20, 28), turns)
+    seen = se3.apply(se3.invert(Pose(c2w[:, :3, :3], c2w[:, :3, 3])), xyz)
+    at = cameras.project(turned, seen.float())
+    torch.testing.assert_close(at, at.round(), atol=2e-3, rtol=0)
+    (u, v), (x, y) = at[0].round().long().T, uv[0].long().T
+    assert torch.equal(convert.rot90_image(image, turns)[v, u], image[y, x])
+
+
 def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
     cams = [Camera(torch.tensor([[60.0, 60.0]]), torch.tensor([[c, 22.25]])) for c in (30.25, 33.5)]
     away = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
@@ -193,6 +210,15 @@ def test_quaternions_and_axes() -> None:
     looking = convert.cv_from_gl(np.eye(4)[None])[0]
     np.testing.assert_array_equal(looking @ [0, 0, 1, 0], [0, 0, -1, 0])  # forward is −z in GL axes
     np.testing.assert_array_equal(looking @ [0, 1, 0, 0], [0, -1, 0, 0])  # down is −y
+    moved = np.eye(4) + np.array([[0.0, 0, 0, 1], [0, 0, 0, 2], [0, 0, 0, 3], [0] * 4])
+    assert convert.cv_from_gl(moved[None])[0, :3, 3].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_between_two_rotations_lies_half_the_shorter_arc(sign: int) -> None:
+    a, b = np.array([[0.0, 0, 0, 1]]), sign * np.array([[0, 0, np.sin(0.5), np.cos(0.5)]])
+    half = convert.slerp(a, b, np.array([0.5]))
+    np.testing.assert_allclose(half, [[0, 0, np.sin(0.25), np.cos(0.25)]], atol=1e-12)
 
 
 def test_drifted_rotation_is_moved_to_the_nearest_one() -> None:
