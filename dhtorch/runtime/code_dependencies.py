@@ -81,18 +81,16 @@ def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
     first, *rest = name.split(".")
     if first != _PACKAGE:
         return _find_external_file(name)
-    packages = ["/".join((*rest[:length], "__init__.py")) for length in range(len(rest) + 1)]
     for length in range(len(rest), -1, -1):
-        module = "/".join(rest[:length]) + ".py"
-        if length and (folder / module).is_file():
+        base = folder.joinpath(*rest[:length])
+        if length and (path := base.with_suffix(".py")).is_file():
             break
-        if (folder / packages[length]).is_file():
-            module = packages[length]
+        if (path := base / "__init__.py").is_file():
             break
     else:
         return {}
-    files = {name: folder / name for name in (module, *reversed(packages[:length]))}
-    return {name: path for name, path in files.items() if path.is_file()}
+    packages = [folder.joinpath(*rest[:above], "__init__.py") for above in range(length - 1, -1, -1)]
+    return {p.relative_to(folder).as_posix(): p for p in (path, *packages) if p.is_file()}
 
 
 def _find_external_file(name: str) -> dict[str, Path]:
