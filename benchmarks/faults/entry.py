@@ -271,8 +271,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("find_reachable_modules", 'p.suffix != ".py"', 'p.suffix == ".json5"'),
         ("find_reachable_modules", "if key in files", "if files"),
         ("iter_imports", "name.split()[0]", "name.split()[-1]"),
-        ("_find_module_files", 'rest[:length]) + ".py"', 'rest[:length]) + ".pyx"'),
-        ("_find_module_files", "(module, *reversed(packages[:length]))", "(module,)"),
+        ("_find_module_files", 'base.with_suffix(".py")', 'base.with_suffix(".pyx")'),
+        ("_find_module_files", "(path, *packages)", "(path,)"),
         ("_find_external_file", "if is_python else {}", "if not is_python else {}"),
     ],
     "runtime.storage": [
