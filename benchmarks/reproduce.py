@@ -101,9 +101,12 @@ EXPERIMENTS = {
 }
 
 #: Result of a script of this folder → its arguments.
-SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
+SCRIPTS = dict.fromkeys(("triangulate", "scaling", "readers"), "")
 SCRIPTS["loader_workers0"] = "--workers 0"
 SCRIPTS |= {
+    **dict.fromkeys(("frontend", "lk", "pnp"), "--clock cpu --repeats 5"),
+    "pair": "--clock cpu --repeats 3",
+    "loader": "--clock cpu --repeats 6",
     "stream": "--clock cpu --repeats 5",
     "dense_speed": "--clock cpu --repeats 5",
     "start": "--clock cpu --repeats 3",

@@ -107,6 +107,11 @@ def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
     return next((r for r in matching if r["bar"]), matching[0] if matching else None)
 
 
+def _is_like(row: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether both rows are of one processor and one commit's code."""
+    return all(row.get(key) == other.get(key) for key in ("processor", "git"))
+
+
 def bars() -> str:
     """Each speed that has a bar, one thread, beside that bar; last its ratio without vectors wider than AVX2's, and
     where freed memory is kept."""
@@ -120,7 +125,7 @@ def bars() -> str:
         cells = [called, f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
         maker = f"{r['processor'].partition('(')[0].partition(',')[0]}, {r.get('git') or 'earlier code'}"
-        others = ["–" if other is None else ratio(other["ratio"]) for other in again]
+        others = ["–" if other is None or not _is_like(other, r) else ratio(other["ratio"]) for other in again]
         rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, *others])
     head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of"]
     head += [{"avx2": "ratio held to AVX2", "kept": "memory kept"}[how] for how in AGAIN]
@@ -128,9 +133,9 @@ def bars() -> str:
 
 
 def stages() -> str:
-    """Milliseconds per pair by stage, one thread."""
+    """Milliseconds per pair by stage, one thread, compiled operators."""
     shown = []
-    rows = {r["name"]: r for r in timings("pair") if (r["threads"], r["mode"]) == (1, "eager")}
+    rows = {r["name"]: r for r in timings("pair") if (r["threads"], r["mode"]) == (1, "compiled")}
     for batch in (1, 8):
         for stage in ("", ".track", ".pose", ".triangulate"):
             cells = [f"B = {batch}, {stage[1:] or 'whole pair'}"]
