@@ -327,6 +327,14 @@ def test_lens_models() -> None:
         ros_images.to_opencv_distortion(info("equidistant", (0.1, 0.0, 0.0, 0.0)), Path("a"))
 
 
+def test_terms_of_a_lens_are_those_of_opencv() -> None:
+    D = torch.tensor([[0.1, -0.2, 0.03, -0.04, 0.05]], dtype=torch.float64)
+    xy = torch.rand(1, 9, 2, generator=torch.manual_seed(0), dtype=torch.float64) - 0.3
+    camera = Camera(torch.ones(1, 2).double(), torch.zeros(1, 2).double(), D)
+    shift = torch.from_numpy(ros_images._brown_conrady_terms(xy[0].numpy())) @ D[0]
+    torch.testing.assert_close(cameras.distort(camera, xy)[0] - xy[0], shift)
+
+
 def test_an_inverse_lens_model_is_inverted() -> None:
     """Ideal coordinates by the stated polynomial are those that the returned lens maps back to the pixel."""
     D = (-0.05, 0.03, 0.0015, -0.002, -0.01)
