@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dhtorch.data import FormatError
-from dhtorch.data.models import Similarity, read_model, write_model
+from dhtorch.data.models import Similarity, network, read_model, write_model
 from tests.support import room_models as made
 
 WRITERS = {
@@ -66,6 +66,16 @@ def test_a_model_is_written_after_a_similarity(tmp_path, kind, turned):
     if len(model.xyz):
         np.testing.assert_allclose(again.xyz, similarity.apply(model.xyz), rtol=1e-5, atol=2e-5)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_similarity_turns_scales_and_shifts() -> None:
+    R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    similarity = Similarity(2.0, R, np.array([10.0, 20.0, 30.0]))
+    assert similarity.apply(np.array([[1.0, 2.0, 3.0]])).tolist() == [[6, 22, 36]]
+    c2w = np.eye(4)
+    c2w[:3, 3] = 1, 2, 3
+    moved = similarity.move(c2w)
+    assert moved[:3, :3].tolist() == R.tolist() and moved[:, 3].tolist() == [6, 22, 36, 1]
 
 
 def test_all_but_lengths_stays(tmp_path):
@@ -143,6 +153,12 @@ def test_arrays_of_other_shapes_and_numbers_are_one_line(tmp_path, changes):
     with pytest.raises(FormatError) as error:
         read_model(folder)
     assert "\n" not in str(error.value) and ": found " in str(error.value) and str(folder) in str(error.value)
+
+
+def test_points_have_three_coordinates(tmp_path):
+    values = {"c2w": np.eye(4)[None], "K": np.eye(3)[None], "points": np.ones((1, 5, 6, 2))}
+    with pytest.raises(FormatError, match=r"depth or points: found shape \(1, 5, 6, 2\)"):
+        list(network._views_of_arrays(tmp_path / "a.npz", values, None))
 
 
 def test_points_that_are_no_places_are_left_out(tmp_path):
