@@ -44,6 +44,10 @@ def test_named_frames_give_back_the_scene(tmp_path: Path) -> None:
     check_same(recording, frames, 1 / 1000)
 
 
+def test_frames_without_numbers_are_counted_from_0() -> None:
+    assert consecutive_frame_numbers(3).tolist() == [0, 1, 2]
+
+
 def test_counted_frames_give_back_the_scene(tmp_path: Path) -> None:
     frames = walk()
     writers.write_counted_frames(tmp_path, frames)
