@@ -88,7 +88,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "ops.csrc.pyramid": [
         ("grey", "luma(unit(r[x]), unit(g[x]), unit(b[x]))", "luma(unit(b[x]), unit(g[x]), unit(r[x]))"),
         ("half", "below.row(0, below.pad + 2 * y + k - 2)", "below.row(0, below.pad + 2 * y + k - 1)"),
-        ("mirror", "right[k] = right[-k];", "right[k] = right[0];"),
+        ("mirror_sides", "right[k] = right[-k];", "right[k] = right[0];"),
         ("gradients", "g_x[pad + x] = across[x + 2] - across[x];", "g_x[pad + x] = across[x] - across[x + 2];"),
         ("gradients", "slope[x] = under[x] - above[x];", "slope[x] = here[x] - above[x];"),
         ("pyramid_level", "data<uint8_t>(source) + b * one", "data<uint8_t>(source)"),

@@ -629,16 +629,17 @@ void window_differences(Tensor source, Tensor target, Tensor x, Tensor y, Tensor
   const float *places = data<float>(x), *others = data<float>(y), size = static_cast<float>(window * window);
   const int64_t* pairs = data<int64_t>(batch);
   float* to = data<float>(sums);
-  std::vector<float> T(count), J(count);
+  std::vector<Lanes> planes(2 * count / LANES);
+  float *T = planes.front().of, *J = T + count;
   for (int64_t m = 0; m < M; ++m) {
     const float from[2] = {places[m], places[M + m]}, at[2] = {others[m], others[M + m]};
-    const float sum = read_plane(here, columns, from, pairs[m], T.data()), other = read_plane(there, columns, at, pairs[m], J.data());
+    const float sum = read_plane(here, columns, from, pairs[m], T), other = read_plane(there, columns, at, pairs[m], J);
     const float mean = remove_bias ? sum / size : 0.0f, other_mean = remove_bias ? other / size : 0.0f;
     const auto each = [&](const auto& take) {  // T and J without their means
       for (int64_t i = 0; i < count; i += columns.wide) {
         for (int64_t j = 0; j < columns.wide; j += LANES) {
           const Bits inside = columns.kept(j);
-          take(masked(load(&T[i + j]) - mean, inside), masked(load(&J[i + j]) - other_mean, inside));
+          take(masked(load(T + i + j) - mean, inside), masked(load(J + i + j) - other_mean, inside));
         }
       }
     };
