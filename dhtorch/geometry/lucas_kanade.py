@@ -143,8 +143,10 @@ def search_displacements(
 def _search_kernel(
     x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor, *, views: _Views
 ) -> tuple[Tensor, Tensor, Tensor]:
-    source, target, o = views.source, views.target, views.o
-    displacement, A, valid = torch.empty_like(d), d.new_empty(3, d.shape[-1]), torch.empty_like(known)
+    source, target = views.source, views.target
+    o = views.o
+    displacement, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
+    valid = torch.empty_like(known)
     torch.ops.dhtorch.lk_search.default(
         source=source.levels,
         target=target.levels,
