@@ -90,7 +90,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("shutter_prior", "*[zero] * 6, *[shutter_precision] * 3", "*[shutter_precision] * 3, *[zero] * 6"),
         ("undo_rolling_shutter", "(uv - c) / f", "(uv + c) / f"),
-        ("_straighten", "u - y * (b1 - b2 * v)", "u + y * (b1 - b2 * v)"),
+        ("_straighten", "ray = ray - y[:, None] * rotate_planes", "ray = ray + y[:, None] * rotate_planes"),
         ("_straighten", "z.abs() < 0.1", "z < 0.1"),
         ("linearise_tracks", "| (best < 0)", "| (best > 0)"),
         ("linearise_tracks", "~(problem.near | (best < 0))", "~(best < 0)"),

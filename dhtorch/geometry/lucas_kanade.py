@@ -30,7 +30,7 @@ from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, ch
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE
 from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
-from dhtorch.ops.dispatch import can_dispatch, operator
+from dhtorch.ops.dispatch import operator
 
 #: Width of a cell, px of its level: on coarse levels, which only provide the start of the next one, the points of a
 #: cell share one search. Cells are nested, so that they share its start as well. Source: origin not recorded.
@@ -184,10 +184,9 @@ def _search_kernel(
     return displacement, valid, A
 
 
-def _reads_plain_levels(*_: Tensor, views: _Views) -> bool:
-    """Whether a kernel may read the levels of both pyramids."""
-    levels = (*views.source.levels, *views.target.levels)
-    return can_dispatch(levels, (((torch.float32,), False),) * len(levels))
+def _levels(*_: Tensor, views: _Views) -> tuple[Tensor, ...]:
+    """Levels of both pyramids."""
+    return *views.source.levels, *views.target.levels
 
 
 @operator(
@@ -199,7 +198,7 @@ def _reads_plain_levels(*_: Tensor, views: _Views) -> bool:
         "known": torch.bool,
         "begun": torch.bool,
     },
-    when=_reads_plain_levels,
+    nested=_levels,
 )
 def _search(
     x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor, *, views: _Views

@@ -37,7 +37,7 @@ from dhtorch.geometry.least_squares import (
     solve_spd,
 )
 from dhtorch.geometry.linalg import rotate_planes
-from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.se3 import Pose, hat
 from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
@@ -133,11 +133,10 @@ def undo_rolling_shutter(
 
 def _straighten(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
     """:func:`undo_rolling_shutter` at z = 1: (u, v, 1) − y · shutter rate × (u, v, 1), divided by its z."""
-    u, v = seen.unbind(1)
-    b0, b1, b2 = shutter_rate[..., None].unbind(1)
-    x = torch.stack((u - y * (b1 - b2 * v), v - y * (b2 * u - b0)), 1)
-    z = (1 - y * (b0 * v - b1 * u))[:, None]
-    return x / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite
+    ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
+    ray = ray - y[:, None] * rotate_planes(hat(shutter_rate), ray)
+    z = ray[:, 2:]
+    return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite
 
 
 class TrackConstants(NamedTuple):

@@ -21,7 +21,7 @@ gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -37,12 +37,16 @@ T = TypeVar("T")
 #: A tensor parameter's dtypes, and whether it may have any strides.
 _Parameter = tuple[tuple[torch.dtype, ...], bool]
 
+#: That of a tensor within an option.
+_NESTED: _Parameter = ((torch.float32,), False)
+
 
 def operator(
     *,
     kernel: Callable[..., Any],
     dtypes: Mapping[str, torch.dtype | tuple[torch.dtype, ...]],
     any_layout: Collection[str] = (),
+    nested: Callable[..., Sequence[Tensor]] | None = None,
     when: Callable[..., bool] | None = None,
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator: a torch function -> the same function, dispatched to ``kernel`` for eligible arguments.
@@ -52,6 +56,7 @@ def operator(
         dtypes: dtypes that the kernel reads, for each positional parameter of the function, or each of its
             ``*tensors``. Such a parameter is a tensor or None.
         any_layout: parameters that need not be contiguous.
+        nested: called with the function's own arguments -> float32 tensors within its options that the kernel reads.
         when: further condition on shapes and options, called with the function's own arguments.
 
     Raises:
@@ -77,7 +82,9 @@ def operator(
                 bound = signature.bind(*args, **kwargs)
                 bound.apply_defaults()
                 args, kwargs = bound.args, bound.kwargs  # type: ignore[assignment]
-            if can_dispatch(args, parameters) and (when is None or when(*args, **kwargs)):
+            inner = () if nested is None else nested(*args, **kwargs)
+            is_eligible = can_dispatch(args, parameters) and can_dispatch(tuple(inner), (_NESTED,) * len(inner))
+            if is_eligible and (when is None or when(*args, **kwargs)):
                 return kernel(*args, **kwargs)
             return reference(*args, **kwargs)
 
