@@ -166,6 +166,7 @@ def next_command(out):
     return shlex.split(line.partition("dhtorch ")[2])
 
 
+@pytest.mark.slow
 def test_the_printed_next_command_runs(command, tmp_path):
     """The way of a phone scan, with a name beyond ASCII: the map is written and the printed command measures the error."""
     name = "it's küche 寝室"

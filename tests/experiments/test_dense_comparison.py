@@ -59,6 +59,7 @@ def pair(room):
     )
 
 
+@pytest.mark.slow
 def test_every_variant_is_judged_where_it_belongs(outcome):
     rows = {name: outcome.scenes(name)["hall"] for name in ("sparse", "dense, at samples", "dense", "sgbm", "dis flow")}
     assert rows["sparse"]["n_candidates"] == rows["dense, at samples"]["n_candidates"]
@@ -68,6 +69,7 @@ def test_every_variant_is_judged_where_it_belongs(outcome):
     assert rows["dense"]["ms"].keys() >= {"sparse", "sweep_2", "sweep_1"}
 
 
+@pytest.mark.slow
 def test_the_summary_is_what_its_points_say(outcome):
     points = {k[1]: p for k, p in outcome.points.items() if k[0] == "hall" and k[2] == "full"}
     both = points["sparse"].keep & points["dense, at samples"].keep

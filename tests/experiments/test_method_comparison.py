@@ -38,6 +38,7 @@ def outcome():
     )
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_first_seed(outcome):
     assert {r["method"] for r in outcome.rows} == {"paper", "strict", "opencv", "kornia"}
     assert not any("seed" in k for k in outcome.summary)
@@ -47,6 +48,7 @@ def test_rows_are_those_of_the_first_seed(outcome):
     assert "synthetic_rotation" not in outcome.scenes("strict")
 
 
+@pytest.mark.slow
 def test_summary_has_every_number_of_the_bars(outcome):
     assert {f"strict.{number}" for number in method_comparison.METHOD_BARS} <= set(outcome.summary)
     assert "strict.median_rel_ratio_at_equal_coverage" in outcome.summary
@@ -58,6 +60,7 @@ def test_summary_has_every_number_of_the_bars(outcome):
     assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
 
 
+@pytest.mark.slow
 def test_a_twin_has_its_coverage_and_error_as_ratios(outcome):
     for number in ("coverage_ratio_to_paper", "error_ratio_to_paper"):
         assert (
@@ -72,6 +75,7 @@ def test_a_twin_has_its_coverage_and_error_as_ratios(outcome):
     assert found["coverage_ratio_to_paper"].value == pytest.approx(0.5) and found["error_ratio_to_paper"].n == 2
 
 
+@pytest.mark.slow
 def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
     for name in ("paper", "strict"):
         found = outcome.summary[f"{name}.convoy_wrong"]
@@ -85,6 +89,7 @@ def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
     assert "opencv.convoy_wrong" not in outcome.summary
 
 
+@pytest.mark.slow
 def test_answers_where_the_camera_turns_are_counted_over_all_seeds(outcome):
     rows = [r for r in outcome.rows if r["scene"] == "synthetic_rotation" and r["pair"] and r["method"] == "paper"]
     found = outcome.summary["paper.rotation_answered"]

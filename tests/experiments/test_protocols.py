@@ -168,8 +168,11 @@ def test_a_candidate_with_a_return_of_the_sensor_raises_with_the_scene():
 @pytest.mark.parametrize(
     "experiment",
     [
-        *(range_split, real_holes, device_pose),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in (heldout, gate_ablation, calibration)),
+        range_split,
+        *(
+            pytest.param(each, marks=pytest.mark.slow)
+            for each in (real_holes, device_pose, heldout, gate_ablation, calibration)
+        ),
     ],
 )
 def test_the_protocols_take_the_truth_test_and_state_what_it_keeps(experiment):

@@ -300,6 +300,7 @@ for shards in (2, 20):
 """
 
 
+@pytest.mark.slow
 def test_memory_is_squares_of_the_features_and_a_shard_however_many_there_are():
     """6,600 x 600, which would take 32 MB: five squares and some copies of one shard, after 2 shards as after 22."""
     F, n = 600, 300
