@@ -108,8 +108,9 @@ def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
 
 
 def _is_like(row: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether both rows are of one processor and one commit's code."""
-    return all(row.get(key) == other.get(key) for key in ("processor", "git"))
+    """Whether both rows are of one processor, whichever vectors it was restricted to, and one commit's code."""
+    processors = [r["processor"].rpartition(",")[0] for r in (row, other)]
+    return processors[0] == processors[1] and row.get("git") == other.get("git")
 
 
 def bars() -> str:
