@@ -39,6 +39,10 @@ MAX_RETURN_ERROR_PX = 0.01
 #: Limits the magnitude of a lens's Jacobian determinant from below, without unit. Source: origin not recorded.
 MIN_DETERMINANT = 1e-12
 
+#: Those of the kernels, in their order: steps, square of a step after which a point stops, px, determinant.
+#: Source: derived, the constants above and the rounding of single precision.
+NEWTON_LIMITS = (NEWTON_STEPS, torch.finfo(torch.float32).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT)
+
 
 @record
 class Camera(Record):
@@ -191,16 +195,14 @@ def rays(camera: Camera, uv: Tensor) -> Tensor:
     By kornia's ``unproject_points`` at depth 1; a lens is undone before.
     """
     check("camera.rays", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
-    if camera.distortion is not None:
-        _check_coefficient_count(camera.distortion)
+    check_lens(camera)
     return _rays(uv, camera.f, camera.c, camera.distortion)
 
 
 def _rays_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor | None) -> Tensor:
     lens = uv.new_empty(0, 0) if distortion is None else distortion.contiguous()
     ray = uv.new_empty(*uv.shape[:2], 3)
-    limits = NEWTON_STEPS, torch.finfo(uv.dtype).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT
-    torch.ops.dhtorch.rays.default(uv.contiguous(), f.contiguous(), c.contiguous(), lens, ray, *limits)
+    torch.ops.dhtorch.rays.default(uv.contiguous(), f.contiguous(), c.contiguous(), lens, ray, *NEWTON_LIMITS)
     return ray
 
 
@@ -242,15 +244,14 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = NEWTON_STEPS) -> 
     check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
-    _check_coefficient_count(camera.distortion)
+    check_lens(camera)
     return _undistort(uv, camera.f, camera.c, camera.distortion, iterations=iterations)
 
 
 def _undistort_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iterations: int) -> Tensor:
     lens = f.contiguous(), c.contiguous(), distortion.contiguous()
     ideal_uv = torch.empty_like(uv, memory_format=torch.contiguous_format)
-    limits = torch.finfo(uv.dtype).eps, MAX_RETURN_ERROR_PX, MIN_DETERMINANT
-    torch.ops.dhtorch.undistort.default(uv.contiguous(), *lens, ideal_uv, iterations, *limits)
+    torch.ops.dhtorch.undistort.default(uv.contiguous(), *lens, ideal_uv, iterations, *NEWTON_LIMITS[1:])
     return ideal_uv
 
 
@@ -293,7 +294,7 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     if camera.distortion is None:
         eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
         return eye.expand(*uv_ideal.shape, 2)
-    _check_coefficient_count(camera.distortion)
+    check_lens(camera)
     return _undistort_jacobian(uv_ideal, camera.f, camera.c, camera.distortion)
 
 
@@ -383,6 +384,13 @@ def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tens
     along = slope * x
     a, c = s + 2 * x * (along + 2 * p2), s + 2 * y * (slope * y + 2 * p1)
     return value, (a, 2 * (y * (along + p2) + x * p1), c)
+
+
+def check_lens(*cameras: Camera) -> None:
+    """Raise ValueError for a lens with other numbers of coefficients than :data:`COEFFICIENTS`. Gradient: none."""
+    for camera in cameras:
+        if camera.distortion is not None:
+            _check_coefficient_count(camera.distortion)
 
 
 def _check_coefficient_count(distortion: Tensor) -> int:

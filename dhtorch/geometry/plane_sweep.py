@@ -176,6 +176,7 @@ def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tens
     front of it (B, N). Gradient: to everything."""
     check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     T, camera = view.T_1_from_0, view.camera
+    cam.check_lens(camera)
     return _project(ray, q, T.R, T.t, view.shutter_rate, *(camera.f, camera.c, camera.distortion))
 
 
@@ -202,16 +203,10 @@ def _project_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
     return uv.mT, in_front
 
 
-def _has_known_lens(*tensors: Any) -> bool:
-    """Whether the lens has as many coefficients as a model of :mod:`dhtorch.geometry.camera`."""
-    return tensors[-1] is None or tensors[-1].shape[-1] in cam.COEFFICIENTS
-
-
 @operator(
     kernel=_project_kernel,
     dtypes=dict.fromkeys(("ray", "q", "R", "t", "shutter_rate", "f", "c", "distortion"), torch.float32),
     any_layout=("ray",),
-    when=_has_known_lens,
 )
 def _project(*tensors: Any) -> tuple[Tensor, Tensor]:
     """:func:`project_inverse_depth` under a motion, into a camera's intrinsics."""

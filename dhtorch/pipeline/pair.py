@@ -539,6 +539,7 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     """
     if camera_0.distortion is None and camera_1.distortion is None:
         return tracks
+    cam.check_lens(camera_0, camera_1)
     fields = tracks.uv_0, tracks.uv_1, tracks.cov, tracks.valid
     lenses = (x for camera in (camera_0, camera_1) for x in (camera.f, camera.c, camera.distortion))
     uv_0, uv_1, cov, valid = _undistort_tracks(*fields, *lenses)
@@ -549,8 +550,7 @@ def _undistort_tracks_kernel(*tensors: Any) -> tuple[Tensor, Tensor, Tensor, Ten
     no_lens = tensors[0].new_empty(0, 0)
     inputs = [no_lens if x is None else x.contiguous() for x in tensors]
     uv_0, uv_1, cov, valid = (torch.empty_like(x) for x in inputs[:4])
-    limits = torch.finfo(uv_0.dtype).eps, cam.MAX_RETURN_ERROR_PX, cam.MIN_DETERMINANT
-    torch.ops.dhtorch.undistort_tracks.default(*inputs, uv_0, uv_1, cov, valid, cam.NEWTON_STEPS, *limits)
+    torch.ops.dhtorch.undistort_tracks.default(*inputs, uv_0, uv_1, cov, valid, *cam.NEWTON_LIMITS)
     return uv_0, uv_1, cov, valid
 
 
@@ -561,14 +561,7 @@ _TRACK_DTYPES = {
 }
 
 
-def _has_known_lenses(*tensors: Any) -> bool:
-    """Whether both lenses have as many coefficients as a model of :mod:`dhtorch.geometry.camera`."""
-    return all(lens is None or lens.shape[-1] in cam.COEFFICIENTS for lens in (tensors[6], tensors[9]))
-
-
-@operator(
-    kernel=_undistort_tracks_kernel, dtypes=_TRACK_DTYPES, any_layout=tuple(_TRACK_DTYPES), when=_has_known_lenses
-)
+@operator(kernel=_undistort_tracks_kernel, dtypes=_TRACK_DTYPES, any_layout=tuple(_TRACK_DTYPES))
 def _undistort_tracks(*tensors: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """:func:`undistort_tracks` of the fields of tracks and the intrinsics of both cameras."""
     seen_0, seen_1, seen_cov, valid = tensors[:4]

@@ -132,80 +132,72 @@ struct Camera {
 
   // Entries of d(ideal) / d(distorted) at ideal pixels u, v.
   void jacobian(Vector u, Vector v, Vector (&J)[2][2]) const {
-    Vector away_u, away_v, a = Vector{} + 1.0f, b = Vector{}, d = a;
-    if (!straight) {
-      lens.distort((u - c[0]) / f[0], (v - c[1]) / f[1], away_u, away_v, a, b, d);
-      lens.invert(a, b, d);
-      J[0][0] = f[0] * a / f[0];
-      J[0][1] = f[0] * b / f[1];
-      J[1][0] = f[1] * b / f[0];
-      J[1][1] = f[1] * d / f[1];
-    } else {
-      J[0][0] = a;
-      J[0][1] = J[1][0] = b;
-      J[1][1] = d;
-    }
+    J[0][0] = J[1][1] = Vector{} + 1.0f;
+    J[0][1] = J[1][0] = Vector{};
+    if (straight) return;
+    Vector away_u, away_v, a, b, d;
+    lens.distort((u - c[0]) / f[0], (v - c[1]) / f[1], away_u, away_v, a, b, d);
+    lens.invert(a, b, d);
+    J[0][0] = f[0] * a / f[0];
+    J[0][1] = f[0] * b / f[1];
+    J[1][0] = f[1] * b / f[0];
+    J[1][1] = f[1] * d / f[1];
   }
 };
+
+// Call `each` with a camera, LANES of its pixels uv (B, N, 2), the number of the first, and how many they are.
+template <typename Each>
+void over_pixels(const Tensor& uv, const Tensor& f, const Tensor& c, const Tensor& distortion, double least, Each each) {
+  const int64_t B = uv.size(0), N = uv.size(1);
+  for (int64_t k = 0; k < B; ++k) {
+    const Camera camera(f, c, distortion, k, least);
+    for (int64_t n = 0; n < N; n += LANES) {
+      const int64_t some = std::min(LANES, N - n), at = N * k + n;
+      Vector u, v;
+      split(data<float>(uv) + 2 * at, some, u, v);
+      each(camera, u, v, at, some);
+    }
+  }
+}
 
 // uv (B, N, 2) px, f and c (B, 2) px, distortion (B, k) float32 -> ideal (B, N, 2) px, NaN where the steps, at most
 // `iterations`, do not return to the pixel within `tolerance_px`. A point stops after a step whose square is at most eps.
 void undistort(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor ideal, int64_t iterations, double eps,
                double tolerance_px, double least) {
-  const int64_t B = uv.size(0), N = uv.size(1);
   const Limits limits = {iterations, static_cast<float>(eps), static_cast<float>(tolerance_px)};
-  for (int64_t k = 0; k < B; ++k) {
-    const Camera camera(f, c, distortion, k, least);
-    for (int64_t n = 0; n < N; n += LANES) {
-      const int64_t some = std::min(LANES, N - n);
-      Vector u, v;
-      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
-      camera.undistort(u, v, limits, u, v);
-      join(u, v, some, data<float>(ideal) + 2 * (N * k + n));
-    }
-  }
+  over_pixels(uv, f, c, distortion, least, [&](const Camera& camera, Vector u, Vector v, int64_t at, int64_t some) {
+    camera.undistort(u, v, limits, u, v);
+    join(u, v, some, data<float>(ideal) + 2 * at);
+  });
 }
 
 // The same pixels, distortion (B, k) or (0, 0) -> rays (B, N, 3), z = 1.
 void rays(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor ray, int64_t iterations, double eps, double tolerance_px,
           double least) {
-  const int64_t B = uv.size(0), N = uv.size(1);
   const Limits limits = {iterations, static_cast<float>(eps), static_cast<float>(tolerance_px)};
-  for (int64_t k = 0; k < B; ++k) {
-    const Camera camera(f, c, distortion, k, least);
-    for (int64_t n = 0; n < N; n += LANES) {
-      const int64_t some = std::min(LANES, N - n);
-      Vector u, v;
-      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
-      camera.undistort(u, v, limits, u, v);
-      u = (u - camera.c[0]) / camera.f[0];
-      v = (v - camera.c[1]) / camera.f[1];
-      float* to = data<float>(ray) + 3 * (N * k + n);
-      for (int64_t i = 0; i < some; ++i) {
-        to[3 * i] = u[i];
-        to[3 * i + 1] = v[i];
-        to[3 * i + 2] = 1.0f;
-      }
+  over_pixels(uv, f, c, distortion, least, [&](const Camera& camera, Vector u, Vector v, int64_t at, int64_t some) {
+    camera.undistort(u, v, limits, u, v);
+    u = (u - camera.c[0]) / camera.f[0];
+    v = (v - camera.c[1]) / camera.f[1];
+    float* to = data<float>(ray) + 3 * at;
+    for (int64_t i = 0; i < some; ++i) {
+      to[3 * i] = u[i];
+      to[3 * i + 1] = v[i];
+      to[3 * i + 2] = 1.0f;
     }
-  }
+  });
 }
 
 // Ideal pixels uv (B, N, 2), f and c (B, 2) px, distortion (B, k) float32 -> d(ideal) / d(distorted), J (B, N, 2, 2).
 void undistort_jacobian(Tensor uv, Tensor f, Tensor c, Tensor distortion, Tensor J, double least) {
-  const int64_t B = uv.size(0), N = uv.size(1);
-  for (int64_t k = 0; k < B; ++k) {
-    const Camera camera(f, c, distortion, k, least);
-    for (int64_t n = 0; n < N; n += LANES) {
-      const int64_t some = std::min(LANES, N - n);
-      Vector u, v, entries[2][2];
-      split(data<float>(uv) + 2 * (N * k + n), some, u, v);
-      camera.jacobian(u, v, entries);
-      float* to = data<float>(J) + 4 * (N * k + n);
-      for (int64_t i = 0; i < some; ++i) {
-        for (int64_t e = 0; e < 4; ++e) to[4 * i + e] = entries[e / 2][e % 2][i];
-      }
+  over_pixels(uv, f, c, distortion, least, [&](const Camera& camera, Vector u, Vector v, int64_t at, int64_t some) {
+    Vector entries[2][2];
+    camera.jacobian(u, v, entries);
+    float* to = data<float>(J) + 4 * at;
+    for (int64_t i = 0; i < some; ++i) {
+      for (int64_t e = 0; e < 4; ++e) to[4 * i + e] = entries[e / 2][e % 2][i];
     }
-  }
+  });
 }
 
 // Covariance cov (2, 2) carried by J, of undistort_tracks in pair.py: entries that are not finite stay as they are.

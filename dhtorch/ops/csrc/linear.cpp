@@ -89,12 +89,7 @@ bool is_collinear(const double* xyz, const bool* used, int64_t N, double max_rat
     reach[n] = std::max({std::fabs(xyz[n]), std::fabs(xyz[N + n]), std::fabs(xyz[2 * N + n])});
     if (used[n]) of_used.push_back(reach[n]);
   }
-  double median = 1;
-  if (!of_used.empty()) {
-    const auto middle = of_used.begin() + (of_used.size() - 1) / 2;
-    std::nth_element(of_used.begin(), middle, of_used.end());
-    median = *middle;
-  }
+  const double median = lower_median(of_used, 1.0);
   double sum[3] = {}, scatter[3][3] = {}, count = 0;
   const auto counts = [&](int64_t n) { return used[n] && reach[n] <= max_ratio * median; };
   for (int64_t n = 0; n < N; ++n) {
@@ -117,22 +112,6 @@ bool is_collinear(const double* xyz, const bool* used, int64_t N, double max_rat
   }
   const double limit = min_spread * trace;
   return 0.5 * (trace * trace - squares) <= limit * limit;
-}
-
-// The pose R, t displaced by xi, of move_pose in least_squares.py.
-void move_pose(double* R, double* t, const double* xi) {
-  const double half[3] = {0.5 * xi[0], 0.5 * xi[1], 0.5 * xi[2]};
-  const double by = 2 / (1 + (half[0] * half[0] + half[1] * half[1] + half[2] * half[2]));
-  const auto cross = [&](const double* b, double* c) {
-    for (int i = 0; i < 3; ++i) c[i] = half[(i + 1) % 3] * b[(i + 2) % 3] - half[(i + 2) % 3] * b[(i + 1) % 3];
-  };
-  for (int k = 0; k < 4; ++k) {
-    double column[3], once[3], twice[3];
-    for (int i = 0; i < 3; ++i) column[i] = k < 3 ? R[3 * i + k] : t[i];
-    cross(column, once);
-    cross(once, twice);
-    for (int i = 0; i < 3; ++i) (k < 3 ? R[3 * i + k] : t[i]) = column[i] + (once[i] + twice[i]) * by + (k < 3 ? 0 : xi[3 + i]);
-  }
 }
 
 // Near points of one pair, in double precision, and the limits of _near_pose in pose.py.

@@ -138,14 +138,6 @@ void depth_variance(Tensor slope, Tensor J, Tensor cov, Tensor cov_pose, Tensor 
   }
 }
 
-// Lower median of values, which are reordered; 0 without one.
-float median(std::vector<float>& values) {
-  if (values.empty()) return 0;
-  const auto middle = values.begin() + (values.size() - 1) / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 // Tracks uv_0, uv_1 (B, N, 2) ideal px, valid (B, N) bool; returns xyz (B, N, 3), sigma (B, N) m; posed (B) bool, R
 // (B, 3, 3), t (B, 3), rate (B, 3), or (0, 3) without a rolling shutter; f_0, c_0, f_1, c_1 (B, 2) px, float32. Outputs,
 // fields of _Parallax: uv (B, N, 2), p, q, a, variance_rel (B, N), noise (B, 1), used (B, N) bool.
@@ -196,7 +188,7 @@ void near_parallax(Tensor uv_0, Tensor uv_1, Tensor valid, Tensor xyz, Tensor si
       if (use) of_near.push_back(point.residual);
       if (tracked && !returned) of_far.push_back(point.residual);
     }
-    data<float>(noise)[k] = std::max(std::max(median(of_near), median(of_far)) / unit, static_cast<float>(min_noise));
+    data<float>(noise)[k] = std::max(std::max(lower_median(of_near, 0.0f), lower_median(of_far, 0.0f)) / unit, static_cast<float>(min_noise));
   }
 }
 

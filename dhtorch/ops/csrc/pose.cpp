@@ -288,20 +288,15 @@ bool solve(const double* sums, double factor, double* step) {
   return true;
 }
 
-// move_pose of least_squares.py.
+// The pose displaced by xi, in double precision.
 Motion moved(const Motion& T, const double* xi) {
-  const double half[3] = {0.5 * xi[0], 0.5 * xi[1], 0.5 * xi[2]}, by = 2 / (1 + dot(half, half));
+  double R[9], t[3];
+  std::copy(&T.R[0][0], &T.R[0][0] + 9, R);
+  std::copy(T.t, T.t + 3, t);
+  move_pose(R, t, xi);
   Motion found;
-  for (int c = 0; c < 4; ++c) {
-    double column[3], once[3], twice[3];
-    for (int i = 0; i < 3; ++i) column[i] = c < 3 ? T.R[i][c] : T.t[i];
-    cross(half, column, once);
-    cross(half, once, twice);
-    for (int i = 0; i < 3; ++i) {
-      const double x = column[i] + (once[i] + twice[i]) * by;
-      (c < 3 ? found.R[i][c] : found.t[i]) = static_cast<float>(c < 3 ? x : x + xi[3 + i]);
-    }
-  }
+  for (int i = 0; i < 9; ++i) found.R[i / 3][i % 3] = static_cast<float>(R[i]);
+  for (int i = 0; i < 3; ++i) found.t[i] = static_cast<float>(t[i]);
   return found;
 }
 

@@ -392,21 +392,7 @@ template <int n>
 void displace(Tracks<float>& of, const double* step) {
   float xi[n];
   for (int i = 0; i < n; ++i) xi[i] = static_cast<float>(step[i]);
-  const float half[3] = {0.5f * xi[0], 0.5f * xi[1], 0.5f * xi[2]};
-  const float by = 2.0f / (1.0f + (half[0] * half[0] + half[1] * half[1] + half[2] * half[2]));
-  const auto cross = [&](const float* b, float* c) {
-    for (int i = 0; i < 3; ++i) c[i] = half[(i + 1) % 3] * b[(i + 2) % 3] - half[(i + 2) % 3] * b[(i + 1) % 3];
-  };
-  for (int c = 0; c < 4; ++c) {
-    float column[3], once[3], twice[3];
-    for (int i = 0; i < 3; ++i) column[i] = c < 3 ? of.R[i][c] : of.t[i];
-    cross(column, once);
-    cross(once, twice);
-    for (int i = 0; i < 3; ++i) {
-      const float x = column[i] + (once[i] + twice[i]) * by;
-      (c < 3 ? of.R[i][c] : of.t[i]) = c < 3 ? x : x + xi[3 + i];
-    }
-  }
+  move_pose(&of.R[0][0], of.t, xi);
   for (int i = 6; i < n; ++i) of.turn[i - 6] += xi[i];
 }
 
@@ -491,14 +477,6 @@ void minimise_tracks(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tenso
   }
 }
 
-// Lower median of values, which are reordered; 1 without one.
-float median(std::vector<float>& values) {
-  if (values.empty()) return 1.0f;
-  const auto middle = values.begin() + (values.size() - 1) / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 // The same tensors without the noise's factors; far (B, N) bool. Output: noise (B, N), after `rounds` estimates from the
 // medians of near and far residuals, each divided by that of unit noise, within [low, high].
 void track_noise(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest,
@@ -535,8 +513,8 @@ void track_noise(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor sh
           if (distant[n + i]) of_far.push_back(at.square[i]);
         }
       }
-      const float close = std::sqrt(median(of_near)) / static_cast<float>(near_median);
-      const float factor[2] = {close, any_far ? std::sqrt(median(of_far)) / static_cast<float>(far_median) : close};
+      const float close = std::sqrt(lower_median(of_near, 1.0f)) / static_cast<float>(near_median);
+      const float factor[2] = {close, any_far ? std::sqrt(lower_median(of_far, 1.0f)) / static_cast<float>(far_median) : close};
       for (int i = 0; i < 2; ++i) {
         found[i] = std::clamp(found[i] * factor[i] * factor[i], static_cast<float>(low), static_cast<float>(high));
       }

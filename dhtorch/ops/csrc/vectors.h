@@ -1,12 +1,14 @@
 // Shared by all kernels: access to a tensor's data, vectors of as many floats as one instruction of this processor
-// processes, and the weights of grey values. See dhtorch/ops/loader.py.
+// processes, medians, motions of a pose, and the weights of grey values. See dhtorch/ops/loader.py.
 
 #pragma once
 
 #include <torch/csrc/stable/tensor.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 #include "constants.h"
 
@@ -142,6 +144,35 @@ inline void totals(Vector a, Vector b, Vector c, Vector d, float* to) {
   to[2] = total(c);
   to[3] = total(d);
 #endif
+}
+
+// Lower median of values, which are reordered; `without` where there is none.
+template <typename T>
+T lower_median(std::vector<T>& values, T without) {
+  if (values.empty()) return without;
+  const auto middle = values.begin() + (values.size() - 1) / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// The pose R (3, 3), t displaced by xi = (rotation rad, translation m), of move_pose in least_squares.py.
+template <typename T>
+void move_pose(T* R, T* t, const T* xi) {
+  const T half[3] = {xi[0] / 2, xi[1] / 2, xi[2] / 2};
+  const T by = 2 / (1 + (half[0] * half[0] + half[1] * half[1] + half[2] * half[2]));
+  const auto cross = [&](const T* b, T* c) {
+    for (int i = 0; i < 3; ++i) c[i] = half[(i + 1) % 3] * b[(i + 2) % 3] - half[(i + 2) % 3] * b[(i + 1) % 3];
+  };
+  for (int k = 0; k < 4; ++k) {
+    T column[3], once[3], twice[3];
+    for (int i = 0; i < 3; ++i) column[i] = k < 3 ? R[3 * i + k] : t[i];
+    cross(column, once);
+    cross(once, twice);
+    for (int i = 0; i < 3; ++i) {
+      const T moved = column[i] + (once[i] + twice[i]) * by;
+      (k < 3 ? R[3 * i + k] : t[i]) = k < 3 ? moved : moved + xi[3 + i];
+    }
+  }
 }
 
 // BT.601 weights of red, green and blue.
