@@ -9,7 +9,9 @@ def _of(*names: str) -> list[str]:
 
 TESTS: dict[str, list[str]] = {
     "ops.csrc.pose": _of("a_pose_from_near_points_agrees_up_to_rounding", "the_reasons_for_no_pose_agree"),
-    "ops.csrc.filters": _of("components_and_torn_pixels_are_equal"),
+    "ops.csrc.filters": _of(
+        "components_are_equal", "filtered_maps_are_equal", "gated_and_merged_maps_agree_up_to_a_root"
+    ),
     "ops.csrc.lens": _of("pixels_of_a_lens_are_the_same_bits", "tracks_in_ideal_pixels_are_the_same_bits"),
     "ops.csrc.linear": _of(
         "solutions_of_small_systems_agree_up_to_rounding",
@@ -47,10 +49,24 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("take", "from[4 * N + of[k]] - c[1]) / fy", "from[4 * N + of[k]] - c[1]) / fx"),
     ],
     "ops.csrc.filters": [
-        ("small_components", "x > 0) visit(across[y * (w - 1) + x - 1]", "x > 0) visit(across[y * (w - 1) + x]"),
-        ("small_components", "component.size()) >= n_pixels", "component.size()) > n_pixels"),
-        ("torn_pixels", "returned[m] && ", ""),
-        ("torn_pixels", "step <= 2", "step <= 1"),
+        ("mark_small", "!row[x - 1] || !across[x - 1]", "!row[x - 1]"),
+        ("mark_small", "runs[b].size += runs[a].size;", ""),
+        ("mark_small", "< n_pixels) std", "<= n_pixels) std"),
+        ("window_extreme", "2 * radius + 1, rows", "2 * radius, rows"),
+        ("halo", "!(goes_on[n] || in_gap(usable, y, x))", "!goes_on[n]"),
+        ("halo", "others[n] &= !beside[n]", "others[n] &= 1"),
+        ("has_neighbour", "met |= (other > low)", "met |= (other > 0.0f)"),
+        ("fattened", "n_far += is_far", "n_far += is_near"),
+        ("torn", "return usable[m] && ", "return "),
+        ("torn", "step <= 2", "step <= 1"),
+        ("unsupported", "right[r] & right[r + w - 1] & down[n]", "right[r] & down[n]"),
+        ("fill", "open[n] || in_gap(mask, y, x)", "open[n]"),
+        ("fit_rim", "noise += sigma[m];", "noise = sigma[m];"),
+        ("filter_map", "found.sigma[n] * (at * at)", "found.sigma[n] * at"),
+        ("gate_map", "all != GATE_ANSWER ? all : code", "code"),
+        ("gate_map", "error > ratio * near[n]", "error > 0.0f"),
+        ("gate_map", "overlap < min_overlap || ", ""),
+        ("merge_maps", "keep ? kind[n] : SOURCE_NONE", "kind[n]"),
     ],
     "ops.csrc.lens": [
         ("distort", "b = 2.0f * (y * (along + p2) + x * p1);", "b = 2.0f * (y * (along + p1) + x * p2);"),

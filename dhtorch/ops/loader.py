@@ -67,7 +67,7 @@ SOURCES = tuple(
 HEADER = FOLDER / "vectors.h"
 
 #: Code tables whose values are in the generated header, as ``<table>_<name>``.
-_CODE_TABLES = (codes.Flag, codes.Hole, codes.Source, codes.PoseCode)
+_CODE_TABLES = (codes.Flag, codes.Gate, codes.Hole, codes.Source, codes.PoseCode)
 
 #: No FMA contraction: torch rounds the product and the sum. ``-fno-math-errno -fno-trapping-math`` let square roots and
 #: selections be vectorised; results are unchanged.

@@ -25,10 +25,12 @@ from dhtorch import pytree
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import plane_sweep
+from dhtorch.geometry.checks import any_possible
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.least_squares import select_batch
 from dhtorch.geometry.se3 import Pose
+from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
@@ -46,6 +48,9 @@ DENSE_RANGES: Final[dict[str, tuple[float, float]]] = {
     "max_sigma_rel": (0, math.inf),
 }
 DENSE_OPTIONS: Final = tuple(DENSE_RANGES)
+
+#: Least inverse depth whose inverse is a swept pixel's depth, 1/m. Source: derived, beyond any depth.
+MIN_INVERSE_DEPTH: Final = 1e-9
 
 
 class SelectedViews(NamedTuple):
@@ -126,8 +131,14 @@ def sweep_views(reference: Frame, selected: SelectedViews, method: MethodSpec, o
 
 def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
     """The swept map (B, h, w) with its gates, before it is filtered by its neighbours."""
-    swept = _gated(sweep.base, sweep.surface, (sweep.beyond, sweep.alone), sweep.pair_gate, options)
-    return _check_against_returns(swept, sweep.returns, sweep.near, options)
+    known = sweep.base.known.unflatten(-1, sweep.base.hw)
+    returns = sweep.returns.depth.detach(), sweep.returns.sigma.detach(), sweep.returns.usable
+    place, scale_error = (sweep.beyond, sweep.alone), _scale_error(sweep.near)
+    depth, sigma, score, source, gate, track, pose, reference = _gate(
+        *sweep.surface, known, *place, sweep.pair_gate, scale_error, *returns, options=options
+    )
+    zero = torch.zeros_like(track[:1, :1, :1]).expand_as(track)
+    return DepthMap(depth, sigma, score, source, gate, SigmaBudget(track, pose, reference, zero, zero))
 
 
 def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
@@ -139,7 +150,8 @@ def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthM
     image, reach, sparse = sweep.base.image, sweep.reach, sweep.sparse
     filtered = filter_map(swept, sweep.returns, image[:, 0], sparse, options)
     filled = fill_planes(filtered, swept, sweep.returns, image, reach, sparse=sparse, options=options)
-    return select_batch(sweep.pair_gate == Gate.ANSWER, filled, swept)
+    is_swept = sweep.pair_gate == Gate.ANSWER
+    return select_batch(is_swept, filled, swept) if any_possible(~is_swept) else filled
 
 
 def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseOptions.size) -> DepthMap:
@@ -297,8 +309,47 @@ def _pair_gate(selected: SelectedViews, use: Tensor) -> Tensor:
     )
 
 
+def _gate_kernel(*tensors: Tensor, options: DenseOptions) -> tuple[Tensor, ...]:
+    maps = [x.contiguous() for x in tensors]
+    columns = [torch.empty_like(maps[0]) for _ in range(3)]
+    codes = [torch.empty_like(maps[0], dtype=torch.int32) for _ in range(2)]
+    parts = [torch.empty_like(maps[0]) for _ in range(3)]
+    limits = (
+        *(options.min_correlation, options.max_sigma_rel, options.refuting_sigmas, options.refuting_ratio),
+        *(options.min_overlap_pixels, MIN_INVERSE_DEPTH),
+    )
+    torch.ops.dhtorch.gate_map.default(*maps, *columns, *codes, *parts, *limits)
+    return (*columns, *codes, *parts)
+
+
+_GATE_DTYPES = (
+    dict.fromkeys(("q", "own", "shared", "correlation"), torch.float32)
+    | dict.fromkeys(("seen", "known", "beyond", "alone"), torch.bool)
+    | {"pair_gate": torch.int32, "scale_error": torch.float32}
+    | {"near_depth": torch.float32, "near_sigma": torch.float32, "usable": torch.bool}
+)
+
+
+@operator(kernel=_gate_kernel, dtypes=_GATE_DTYPES, any_layout=tuple(_GATE_DTYPES))
+def _gate(*tensors: Any, options: DenseOptions) -> tuple[Tensor, ...]:
+    """Depth, sigma, score, source and gate (B, h, w) of a surface, and its variances by cause.
+
+    Args:
+        tensors: the fields of the surface; whether the lens model has a ray, the surface is nearer than the nearest
+            plane, and its best plane is unique (B, h, w) bool; gate of all pixels (B,); relative error of the scale
+            (B,); depth, sigma and usability of the returns (B, h, w).
+        options: tuning constants.
+    """
+    known, beyond, alone, pair_gate, scale_error, *returns = tensors[5:]
+    swept = _gated(known, surface.RefinedSurface(*tensors[:5]), (beyond, alone), pair_gate, options)
+    swept = _check_against_returns(swept, returns, scale_error, options)
+    assert swept.parts is not None
+    parts = swept.parts.track, swept.parts.pose, swept.parts.reference
+    return (swept.depth, swept.sigma, swept.score, swept.source, swept.gate, *parts)
+
+
 def _gated(
-    base: plane_sweep.ReferenceView,
+    known: Tensor,  # (B, h, w) bool, the lens model has a ray
     fitted: surface.RefinedSurface,
     place: tuple[Tensor, Tensor],  # (B, h, w) bool each: nearer than the nearest plane, unique best plane
     pair_gate: Tensor,  # (B,)
@@ -306,10 +357,9 @@ def _gated(
 ) -> DepthMap:
     """The swept map (B, h, w): depth, sigma and score of the fitted surface with their gates."""
     beyond, alone = place
-    depth = 1 / fitted.q.clamp_min(1e-9)
+    depth = 1 / fitted.q.clamp_min(MIN_INVERSE_DEPTH)
     sigma_rel = (fitted.own + fitted.shared).sqrt() * depth.detach()
-    is_known = base.known.unflatten(-1, base.hw)
-    untracked = ~is_known | ~fitted.seen | beyond | (fitted.correlation < options.min_correlation)
+    untracked = ~known | ~fitted.seen | beyond | (fitted.correlation < options.min_correlation)
     uncertain = ~(sigma_rel <= options.max_sigma_rel) | ~alone
     gate = first_reason((untracked, Gate.NO_TRACK), (uncertain, Gate.UNCERTAIN))
     pair_gate = pair_gate[:, None, None]
@@ -340,12 +390,22 @@ def _returns(reference: Frame, method: MethodSpec, hw: tuple[int, int]) -> Senso
     return SensorReturns(*(x.unflatten(1, hw) for x in columns))
 
 
-def _check_against_returns(swept: DepthMap, returns: SensorReturns, near: Samples, options: DenseOptions) -> DepthMap:
-    """The swept map, CONTRADICTED where near returns refute it, with the metric scale's uncertainty added to sigma.
+def _scale_error(near: Samples) -> Tensor:
+    """Relative error (B,) of the metric scale, which affects all pixels alike: it is as uncertain as the near samples
+    (B, N) that it comes from, their median sigma / depth. Gradient: none."""
+    has_sigma = near.usable & (near.depth > 0)
+    error = masked_median(near.sigma / torch.where(has_sigma, near.depth, torch.ones_like(near.depth)), has_sigma)
+    return torch.where(has_sigma.any(-1, keepdim=True), error, 0.0)[:, 0].detach()
 
-    The scale is as uncertain as the near samples (B, N) that it comes from: their median sigma / depth.
-    """
-    usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
+
+def _check_against_returns(
+    swept: DepthMap,
+    returns: Sequence[Tensor],  # (B, h, w) depth and sigma in m, usable
+    scale_error: Tensor,  # (B,)
+    options: DenseOptions,
+) -> DepthMap:
+    """The swept map, CONTRADICTED where near returns refute it, with the metric scale's uncertainty added to sigma."""
+    depth, sigma, usable = returns
     swept_sigma = swept.sigma.detach()
     overlap = usable & swept.keep
     error = (torch.where(overlap, swept.depth.detach() - depth, 0.0)).abs()
@@ -354,25 +414,43 @@ def _check_against_returns(swept: DepthMap, returns: SensorReturns, near: Sample
     n = overlap.sum((1, 2))
     refuted = (n >= options.min_overlap_pixels) & (2 * wrong.sum((1, 2)) > n)
     gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
-    has_sigma = near.usable & (near.depth > 0)
-    scale_error = masked_median(near.sigma / torch.where(has_sigma, near.depth, torch.ones_like(near.depth)), has_sigma)
-    scale_error = torch.where(has_sigma.any(-1, keepdim=True), scale_error, 0.0)
-    scale_error = scale_error[..., None].detach()  # a wrong scale affects all pixels alike
-    by_sensor = (scale_error * swept.depth.detach()).square()
+    by_sensor = (scale_error[:, None, None] * swept.depth.detach()).square()
     parts = None if swept.parts is None else swept.parts.replace(reference=by_sensor)
     return swept.replace(sigma=(swept_sigma.square() + by_sensor).sqrt(), gate=gate, parts=parts)
 
 
 def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
     """The sensor's returns where they are usable, else the swept map where it is answered."""
-    usable = returns.usable
-    keep = swept.keep & ~usable
-    nan = torch.full_like(swept.depth, torch.nan)
-    return DepthMap(
-        depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, swept.depth, nan)),
-        sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, swept.sigma, nan)),
-        score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, swept.score, 0.0)),
-        source=torch.where(keep, swept.source, Source.NONE).masked_fill(usable, Source.SENSOR),
-        gate=swept.gate.masked_fill(usable, Gate.ANSWER),
-        parts=swept.parts,
+    columns = swept.depth, swept.sigma, swept.score, swept.source, swept.gate
+    sensed = (x.to(swept.depth) for x in (returns.depth, returns.sigma, returns.confidence))
+    depth, sigma, score, source, gate = _merge(*columns, *sensed, returns.usable)
+    return DepthMap(depth, sigma, score, source, gate, swept.parts)
+
+
+def _merge_kernel(*tensors: Tensor) -> tuple[Tensor, ...]:
+    merged = [x.clone(memory_format=torch.contiguous_format) for x in tensors[:5]]
+    torch.ops.dhtorch.merge_maps.default(*merged, *(x.contiguous() for x in tensors[5:]))  # in place
+    return tuple(merged)
+
+
+_MERGE_DTYPES = (
+    dict.fromkeys(("depth", "sigma", "score"), torch.float32)
+    | dict.fromkeys(("source", "gate"), torch.int32)
+    | dict.fromkeys(("near_depth", "near_sigma", "confidence"), torch.float32)
+    | {"usable": torch.bool}
+)
+
+
+@operator(kernel=_merge_kernel, dtypes=_MERGE_DTYPES, any_layout=tuple(_MERGE_DTYPES))
+def _merge(*tensors: Any) -> tuple[Tensor, ...]:
+    """:func:`merge_returns` of the fields of both maps (B, h, w)."""
+    depth, sigma, score, source, gate, near_depth, near_sigma, confidence, usable = tensors
+    keep = (gate == Gate.ANSWER) & ~usable
+    nan = torch.full_like(depth, torch.nan)
+    return (
+        torch.where(usable, near_depth, torch.where(keep, depth, nan)),
+        torch.where(usable, near_sigma, torch.where(keep, sigma, nan)),
+        torch.where(usable, confidence, torch.where(keep, score, 0.0)),
+        torch.where(keep, source, Source.NONE).masked_fill(usable, Source.SENSOR),
+        gate.masked_fill(usable, Gate.ANSWER),
     )

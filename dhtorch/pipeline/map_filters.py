@@ -14,7 +14,7 @@ second pixel, in both directions, and only around the pixels in question.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -65,6 +65,12 @@ class _Known(NamedTuple):
         """(B, h, w) bool: a return or a swept depth."""
         return self.usable | self.swept
 
+    def without(self, which: Tensor) -> _Known:
+        """The map without the swept depths ``which`` (B, h, w) bool."""
+        return _Known(
+            self.q.masked_fill(which, 0.0), self.sigma.masked_fill(which, 0.0), self.usable, self.swept & ~which
+        )
+
 
 def filter_map(
     swept: DepthMap,
@@ -89,19 +95,55 @@ def filter_map(
     reach = _reach(returns, options)[:, None, None]
     within = returns.usable & (returns.depth.detach() < options.halo_reach * reach)
     within = within if sparse is None else within & ~sparse[:, None, None]
-    grey = grey.detach()
-    swept = _silence(swept, _halo(_known(swept, returns), within, options))
-    swept = _silence(swept, _fattened(_known(swept, returns), grey, options))
-    swept = _silence(swept, _torn(_known(swept, returns), grey, options))
-    swept = _silence(swept, _unsupported(_known(swept, returns), options))
-    where, q, sigma = _fill(_known(swept, returns), within, options)
+    columns = swept.depth, swept.sigma, swept.score, swept.source, swept.gate
+    sensed = returns.depth, returns.sigma, returns.usable, within
+    depth, sigma, score, source, gate = _filter(*columns, *sensed, grey.detach(), options=options)
+    return swept.replace(depth=depth, sigma=sigma, score=score, source=source, gate=gate)
+
+
+#: Fields of :class:`DenseOptions` that the kernel reads, in its order. Source: derived, its declaration.
+_KERNEL_OPTIONS = (
+    *("halo_radius_px", "background_radius_px", "speck_px", "hole_radius_px", "max_gap_px", "min_rim_pixels"),
+    *("step_ratio", "step_sigmas", "grey_similarity", "fattened_ratio", "seam_sigmas", "seam_ratio"),
+    *("same_surface_ratio", "same_surface_sigmas", "rim_ratio"),
+)
+
+
+def _filter_kernel(*maps: Tensor, options: DenseOptions) -> tuple[Tensor, ...]:
+    filtered = [x.clone(memory_format=torch.contiguous_format) for x in maps[:5]]
+    others = [x.contiguous() for x in maps[5:]]
+    limits = [getattr(options, name) for name in _KERNEL_OPTIONS]
+    torch.ops.dhtorch.filter_map.default(*filtered, *others, *limits, _MIN_DETERMINANT, _MIN_INVERSE_DEPTH)  # in place
+    return tuple(filtered)
+
+
+_FILTER_DTYPES = (
+    dict.fromkeys(("depth", "sigma", "score"), torch.float32)
+    | dict.fromkeys(("source", "gate"), torch.int32)
+    | dict.fromkeys(("near_depth", "near_sigma"), torch.float32)
+    | dict.fromkeys(("usable", "within"), torch.bool)
+    | {"grey": torch.float32}
+)
+
+
+@operator(kernel=_filter_kernel, dtypes=_FILTER_DTYPES, any_layout=tuple(_FILTER_DTYPES))
+def _filter(*maps: Any, options: DenseOptions) -> tuple[Tensor, ...]:
+    """:func:`filter_map` of the fields of a swept map, of the returns, of those ``within`` the reach, and a picture."""
+    swept, (near_depth, near_sigma, usable, within, grey) = DepthMap(*maps[:5]), maps[5:]
+    before = known = _known(swept, SensorReturns(near_depth, near_sigma, torch.zeros_like(near_sigma), usable))
+    known = known.without(_halo(known, within, options))
+    known = known.without(_fattened(known, grey, options))
+    known = known.without(_torn(known, grey, options))
+    known = known.without(_unsupported(known, options))
+    swept = _silence(swept, before.swept & ~known.swept)
+    where, q, sigma = _fill(known, within, options)
     depth = 1 / q
-    return swept.replace(
-        depth=torch.where(where, depth, swept.depth),
-        sigma=torch.where(where, sigma * depth.square(), swept.sigma),
-        score=torch.where(where, 0.1 / (0.1 + sigma * depth), swept.score),
-        source=swept.source.masked_fill(where, Source.FILLED),
-        gate=swept.gate.masked_fill(where, Gate.ANSWER),
+    return (
+        torch.where(where, depth, swept.depth),
+        torch.where(where, sigma * depth.square(), swept.sigma),
+        torch.where(where, 0.1 / (0.1 + sigma * depth), swept.score),
+        swept.source.masked_fill(where, Source.FILLED),
+        swept.gate.masked_fill(where, Gate.ANSWER),
     )
 
 
@@ -218,30 +260,7 @@ def _torn(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
 
     Depths that differ by more than ``seam_ratio`` are those of two surfaces that look alike.
     """
-    return _torn_pixels(*known, grey, options=options)
-
-
-def _torn_pixels_kernel(
-    q: Tensor, sigma: Tensor, usable: Tensor, swept: Tensor, grey: Tensor, *, options: DenseOptions
-) -> Tensor:
-    maps = [x.contiguous() for x in (q, sigma, usable, swept, grey)]
-    torn = torch.empty_like(maps[3])
-    limits = options.seam_sigmas, options.seam_ratio, options.grey_similarity
-    torch.ops.dhtorch.torn_pixels.default(*maps, torn, *limits)
-    return torn
-
-
-_TORN_DTYPES = {
-    name: torch.bool if name in ("usable", "swept") else torch.float32
-    for name in ("q", "sigma", "usable", "swept", "grey")
-}
-
-
-@operator(kernel=_torn_pixels_kernel, dtypes=_TORN_DTYPES, any_layout=tuple(_TORN_DTYPES))
-def _torn_pixels(
-    q: Tensor, sigma: Tensor, usable: Tensor, swept: Tensor, grey: Tensor, *, options: DenseOptions
-) -> Tensor:
-    """:func:`_torn` of maps (B, h, w)."""
+    q, sigma, usable, swept = known
     out = torch.zeros_like(swept)
     for step in (1, 2):
         for dy, dx in _SIDES:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,7 @@ from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
 from dhtorch import WINDOW, codes
-from dhtorch.codes import PoseCode, Source
+from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import (
     affine_alignment,
     components,
@@ -45,9 +46,10 @@ from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import builder, constants, dispatch, loader
 from dhtorch.pipeline import dense, map_filters, surface
+from dhtorch.pipeline.dense_options import DenseOptions
 from dhtorch.pipeline.pair import merge, undistort_tracks
 from dhtorch.pipeline.presets import AUTO
-from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.records import NO_HINT, DepthMap, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages import misalignment, pose
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
@@ -432,25 +434,114 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning, co
 
 @needs_compiler
 @pytest.mark.parametrize("share", [0.4, 0.59, 0.7])
-def test_components_and_torn_pixels_are_equal(loaded, monkeypatch, share):
+def test_components_are_equal(loaded, monkeypatch, share):
     g = torch.Generator().manual_seed(0)
-
-    def uniform(*shape):
-        return torch.rand(*shape, generator=g)
-
-    mask, cuts = uniform(2, 40, 53) < share, (uniform(2, 40, 52) < 0.9, uniform(2, 39, 53) < 0.9)
-    asked = counted(monkeypatch, "small_components"), counted(monkeypatch, "torn_pixels")
+    mask = torch.rand(2, 40, 53, generator=g) < share
+    cuts = torch.rand(2, 40, 52, generator=g) < 0.9, torch.rand(2, 39, 53, generator=g) < 0.9
+    calls = counted(monkeypatch, "small_components")
     for n, same in ((2, None), (7, cuts), (30, cuts)):
         found, expected = both_ways(lambda n=n, same=same: components.small_components(mask, n, same=same), monkeypatch)
         assert torch.equal(found, expected) and (n != 7 or 0 < int(expected.sum()) < int(mask.sum()))
-    known = map_filters._Known(
-        1 + uniform(2, 40, 53), 0.02 * uniform(2, 40, 53), mask, ~mask & (uniform(2, 40, 53) < 0.8)
-    )
-    options = map_filters.DenseOptions()
-    grey = 0.1 * uniform(2, 40, 53)
-    found, expected = both_ways(lambda: map_filters._torn(known, grey, options), monkeypatch)
-    assert [len(x) for x in asked] == [3, 1]
-    assert torch.equal(found, expected) and 0 < int(expected.sum()) < int(known.swept.sum())
+    assert len(calls) == 3
+
+
+def a_map_with_artefacts(hw, g):
+    """Boxes before a slanted wall: swept depths with halos, specks and holes, returns on some boxes, and a picture."""
+    h, w = hw
+    rows, columns = torch.arange(h)[:, None], torch.arange(w)
+    q, sensed = (0.2 + 0.001 * columns + 0.0005 * rows).expand(3, h, w).clone(), torch.zeros(3, h, w).bool()
+    seen = q.clone()  # what the picture shows
+    for k in range(12):
+        sides = 4 + 14 * torch.rand(2, generator=g) * (1 + (k > 8))
+        top, left = ((n - 2) * x for n, x in zip(hw, torch.rand(2, generator=g), strict=True))
+        box = (rows - top).abs().lt(sides[0]) & (columns - left).abs().lt(sides[1])
+        wider = (rows - top).abs().lt(sides[0] + 3) & (columns - left).abs().lt(sides[1] + 3)
+        depth = 0.25 + 0.5 * torch.rand(1, generator=g)
+        q[k % 3] = torch.where(wider, depth, q[k % 3])
+        seen[k % 3] = torch.where(box, depth, seen[k % 3])
+        if k % 2:
+            sensed[k % 3] |= box
+    q = q * (1 + 0.004 * torch.randn(3, h, w, generator=g))
+    speck = torch.rand(3, h, w, generator=g) < 0.01
+    depth = 1 / torch.where(speck, 2 * q, q)
+    keep = torch.rand(3, h, w, generator=g) < torch.tensor([0.97, 0.9, 0.7])[:, None, None]
+    usable = sensed & (torch.rand(3, h, w, generator=g) < 0.98)
+    score = keep * torch.rand(3, h, w, generator=g)
+    gate = torch.where(keep, Gate.ANSWER, Gate.NO_TRACK).int()
+    columns = torch.where(keep, depth, torch.nan), torch.where(keep, 0.01 * depth, torch.nan), score
+    swept = DepthMap(*columns, keep.int() * Source.SWEPT, gate)
+    near = torch.where(usable, 1.02 / seen, 0.0)
+    returns = map_filters.SensorReturns(near, 0.01 * near, usable.float(), usable)
+    return swept, returns, seen + 0.01 * torch.rand(3, h, w, generator=g)
+
+
+@needs_compiler
+@pytest.mark.parametrize("hw", [(60, 77), (23, 90), (2, 9), (1, 1)])
+def test_filtered_maps_are_equal(loaded, monkeypatch, hw):
+    """Sigma of filled pixels up to one rounding: torch's root is not always the nearest number."""
+    swept, returns, grey = a_map_with_artefacts(hw, torch.Generator().manual_seed(2))
+    options = replace(DenseOptions(), speck_px=9)
+    sparse = torch.tensor([False, False, True])
+    calls = counted(monkeypatch, "filter_map")
+    found, expected = both_ways(lambda: map_filters.filter_map(swept, returns, grey, sparse, options), monkeypatch)
+    assert len(calls) == 1
+    for name in ("depth", "score", "source", "gate"):
+        assert torch.equal(getattr(found, name).nan_to_num(-1), getattr(expected, name).nan_to_num(-1)), name
+    torch.testing.assert_close(found.sigma, expected.sigma, rtol=2.5e-7, atol=0, equal_nan=True)
+    for k in range(3):  # as if alone
+        alone = map_filters.filter_map(swept[[k]], returns_of(returns, k), grey[[k]], sparse[[k]], options)
+        assert torch.equal(alone.depth.nan_to_num(-1), found.depth[[k]].nan_to_num(-1))
+    if hw != (60, 77):
+        return
+    known = map_filters._known(swept, returns)
+    within = returns.usable & ~sparse[:, None, None]
+    for some in (
+        map_filters._halo(known, within, options),
+        map_filters._fattened(known, grey, options),
+        map_filters._torn(known, grey, options),
+        map_filters._unsupported(known, options),
+        map_filters._fill(known, within, options)[0],
+    ):
+        assert int(some.sum()) > 9
+    assert int((found.gate != swept.gate).sum()) > 100 and int((found.source == Source.FILLED).sum()) > 50
+
+
+@needs_compiler
+def test_gated_and_merged_maps_agree_up_to_a_root(loaded, monkeypatch):
+    """Four views: one refuted by its returns, one with a gate of its own, one with too few returns to be refuted."""
+    g = torch.Generator().manual_seed(5)
+
+    def uniform(low=0.0, high=1.0):
+        return low + (high - low) * torch.rand(4, 31, 23, generator=g)
+
+    q = uniform(-0.01, 0.5)
+    own, shared = (1e-3 * uniform() * q.square() for _ in range(2))
+    flags = [uniform() < share for share in (0.9, 0.95, 0.05, 0.9)]
+    pair_gate = torch.tensor([0, Gate.NO_POSE, 0, 0], dtype=torch.int32)
+    usable = (uniform() < 0.3) & (torch.arange(31 * 23).view(31, 23) < torch.tensor([999, 999, 999, 9])[:, None, None])
+    off = torch.tensor([1.0, 1.0, 1.6, 1.6])[:, None, None]
+    near = torch.where(usable, off * uniform(0.9, 1.1) / q.clamp_min(1e-3), 0.0)
+    options = replace(DenseOptions(), min_overlap_pixels=20, max_sigma_rel=0.04, min_correlation=0.1)
+    surfaces = q, own, shared, uniform(), *flags, pair_gate, torch.tensor([0.01, 0.02, 0.0, 0.03])
+    calls = counted(monkeypatch, "gate_map"), counted(monkeypatch, "merge_maps")
+    found, expected = both_ways(lambda: dense._gate(*surfaces, near, 0.01 * near, usable, options=options), monkeypatch)
+    roots = (1, 2)  # sigma and score
+    for k, (a, b) in enumerate(zip(found, expected, strict=True)):
+        torch.testing.assert_close(a, b, rtol=2.5e-7 if k in roots else 0, atol=0, equal_nan=True)
+    codes = [set(x.unique().tolist()) for x in found[4]]
+    kept, silent = {Gate.ANSWER, Gate.UNCERTAIN, Gate.NO_TRACK}, {Gate.NO_TRACK, Gate.UNCERTAIN}
+    assert codes == [kept, {Gate.NO_POSE}, silent | {Gate.CONTRADICTED}, kept]
+    swept = DepthMap(*found[:5])
+    returns = map_filters.SensorReturns(near, 0.01 * near, uniform(), usable)
+    merged = both_ways(lambda: dense.merge_returns(swept, returns), monkeypatch)
+    for name in ("depth", "sigma", "score", "source", "gate"):
+        a, b = (getattr(x, name) for x in merged)
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+    assert [len(x) for x in calls] == [1, 1]
+
+
+def returns_of(returns, k):
+    return map_filters.SensorReturns(*(x[[k]] for x in returns))
 
 
 @needs_compiler

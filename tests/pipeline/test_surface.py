@@ -125,7 +125,7 @@ def test_a_few_returns_refute_no_motion(scene):
 
 def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
     best = surface.sweep_planes
-    monkeypatch.setattr(surface, "sweep_planes", lambda *a: best(*a)._replace(alone=torch.tensor(False)))
+    monkeypatch.setattr(surface, "sweep_planes", lambda *a: (x := best(*a))._replace(alone=torch.zeros_like(x.alone)))
     found = mapped(scene)
     assert not bool((found.source == Source.SWEPT).any())
     assert bool((found.gate[found.source == Source.NONE] == Gate.UNCERTAIN).any())

@@ -27,16 +27,33 @@ inline void large_pages(void* from, size_t bytes) {
 #endif
 }
 
-inline int32_t bits(int32_t code) {  // set bits of the lower 31, as count_set_bits; few vector units have an instruction
-#ifdef __AVX512VPOPCNTDQ__
-  return __builtin_popcount(code);
+// Set bits of each lane, as count_set_bits.
+inline Bits set_bits(Bits code) {
+#if defined(__AVX512BW__)
+  const __m512i x = reinterpret_cast<__m512i>(code), nibble = _mm512_set1_epi8(0x0F),
+                counts = _mm512_broadcast_i32x4(_mm_setr_epi8(0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4));
+  const __m512i bytes = _mm512_add_epi8(_mm512_shuffle_epi8(counts, _mm512_and_si512(x, nibble)),
+                                        _mm512_shuffle_epi8(counts, _mm512_and_si512(_mm512_srli_epi32(x, 4), nibble)));
+  const __m512i pairs = _mm512_maddubs_epi16(bytes, _mm512_set1_epi8(1));
+  return reinterpret_cast<Bits>(_mm512_madd_epi16(pairs, _mm512_set1_epi16(1)));
+#elif defined(__AVX2__)
+  const __m256i x = reinterpret_cast<__m256i>(code), nibble = _mm256_set1_epi8(0x0F),
+                counts = _mm256_broadcastsi128_si256(_mm_setr_epi8(0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4));
+  const __m256i bytes = _mm256_add_epi8(_mm256_shuffle_epi8(counts, _mm256_and_si256(x, nibble)),
+                                        _mm256_shuffle_epi8(counts, _mm256_and_si256(_mm256_srli_epi32(x, 4), nibble)));
+  const __m256i pairs = _mm256_maddubs_epi16(bytes, _mm256_set1_epi8(1));
+  return reinterpret_cast<Bits>(_mm256_madd_epi16(pairs, _mm256_set1_epi16(1)));
 #else
-  uint32_t x = static_cast<uint32_t>(code);
-  x = x - ((x >> 1) & 0x55555555u);
-  x = (x & 0x33333333u) + ((x >> 2) & 0x33333333u);
-  x = (x + (x >> 4)) & 0x0F0F0F0Fu;
-  return static_cast<int32_t>((x * 0x01010101u) >> 24);
+  for (int64_t i = 0; i < LANES; ++i) code[i] = __builtin_popcount(static_cast<uint32_t>(code[i]));
+  return code;
 #endif
+}
+
+// Whole part of x within 0 and `most`; 0 where it is no number.
+inline Bits whole_within(Vector x, float most) {
+  x = x > 0.0f ? x : Vector{};
+  x = x < most ? x : Vector{} + most;
+  return __builtin_convertvector(x, Bits);
 }
 
 // Add the census cost of every pixel and plane to C (B, h, w, D) uint8, or write it if C is `fresh`. code_0 (B, N) and
@@ -45,45 +62,45 @@ inline int32_t bits(int32_t code) {  // set bits of the lower 31, as count_set_b
 void add_census_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
                       int64_t columns, int64_t margin, int64_t unseen, double min_depth_ratio, double behind_scale,
                       bool fresh) {
-  const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1);
+  typedef uint8_t Bytes __attribute__((vector_size(LANES)));
+  const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1), blocks = (D + LANES - 1) / LANES;
   const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
               down = static_cast<float>(rows - 1);
   const float min_ratio = static_cast<float>(min_depth_ratio), behind = static_cast<float>(behind_scale);
-  const int32_t width = static_cast<int32_t>(columns), none = static_cast<int32_t>(unseen);
-  std::vector<float> scale(D), along(D), across(D);
-  std::vector<int32_t> cell(D);
+  const Bits none = Bits{} + static_cast<int32_t>(unseen);
+  std::vector<Lanes> scale(blocks), along(blocks), across(blocks);
   if (fresh) large_pages(data<uint8_t>(C), B * N * D);
   for (int64_t k = 0; k < B; ++k) {
     const float *bk = data<float>(b) + 2 * k, *qk = data<float>(q) + D * k, *ak = data<float>(a) + 2 * N * k;
     for (int64_t d = 0; d < D; ++d) {
       const float z = 1.0f + qk[d] * data<float>(c)[k];
-      scale[d] = z > min_ratio ? 1.0f / z : behind;
-      along[d] = qk[d] * bk[0];
-      across[d] = qk[d] * bk[1];
+      scale[d / LANES].of[d % LANES] = z > min_ratio ? 1.0f / z : behind;
+      along[d / LANES].of[d % LANES] = qk[d] * bk[0];
+      across[d / LANES].of[d % LANES] = qk[d] * bk[1];
     }
     const int32_t *here = data<int32_t>(code_0) + N * k, *there = data<int32_t>(code_1) + M * k;
     uint8_t* cost = data<uint8_t>(C) + N * D * k;
-    const float *s = scale.data(), *u_step = along.data(), *v_step = across.data();
-    int32_t* at = cell.data();
     for (int64_t n = 0; n < N; ++n, cost += D) {
       const float u0 = ak[n], v0 = ak[N + n];
-      const int32_t own = here[n];
-#pragma GCC ivdep
-      for (int64_t d = 0; d < D; ++d) {
-        float u = (u0 + u_step[d]) * s[d] + inside, v = (v0 + v_step[d]) * s[d] + inside;
-        u = u > 0.0f ? u : 0.0f;
-        v = v > 0.0f ? v : 0.0f;
-        u = u < right ? u : right;
-        v = v < down ? v : down;
-        at[d] = static_cast<int32_t>(v) * width + static_cast<int32_t>(u);
+      const Bits own = Bits{} + here[n];
+      for (int64_t i = 0; i < blocks; ++i) {
+        const Vector s = load(scale[i].of);
+        const Bits column = whole_within((u0 + load(along[i].of)) * s + inside, right),
+                   row = whole_within((v0 + load(across[i].of)) * s + inside, down);
+        const Bits code = gather(there, row * static_cast<int32_t>(columns) + column);
+        Bytes added = __builtin_convertvector(code < 0 ? none : set_bits(code ^ own), Bytes);
+        const int64_t count = std::min(LANES, D - i * LANES);
+        if (!fresh) {
+          Bytes before = {};
+          std::memcpy(&before, cost + i * LANES, count);
+          added += before;
+        }
+        if (count == LANES) {
+          std::memcpy(cost + i * LANES, &added, LANES);
+        } else {
+          std::memcpy(cost + i * LANES, &added, count);
+        }
       }
-#pragma GCC ivdep
-      for (int64_t d = 0; d < D; ++d) {
-        const int32_t code = there[at[d]];
-        at[d] = code < 0 ? none : bits(code ^ own);
-      }
-#pragma GCC ivdep
-      for (int64_t d = 0; d < D; ++d) cost[d] = static_cast<uint8_t>((fresh ? 0 : cost[d]) + at[d]);
     }
   }
 }

@@ -96,6 +96,22 @@ inline float over(float x) {
 #endif
 }
 
+// from[at] of each lane.
+inline Bits gather(const int32_t* from, Bits at) {
+#if defined(__AVX512F__)
+  return reinterpret_cast<Bits>(_mm512_i32gather_epi32(reinterpret_cast<__m512i>(at), from, 4));
+#elif defined(__AVX2__)
+  return reinterpret_cast<Bits>(_mm256_i32gather_epi32(from, reinterpret_cast<__m256i>(at), 4));
+#else
+  for (int64_t i = 0; i < LANES; ++i) at[i] = from[at[i]];
+  return at;
+#endif
+}
+
+inline Vector gather(const float* from, Bits at) {
+  return reinterpret_cast<Vector>(gather(reinterpret_cast<const int32_t*>(from), at));
+}
+
 // Sum of the lanes, by halves.
 inline float total(Vector x) {
 #ifdef DHTORCH_SHUFFLES  // g++ 12 has none and would write the vector to memory
