@@ -50,7 +50,7 @@ DENSE_RANGES: Final[dict[str, tuple[float, float]]] = {
 DENSE_OPTIONS: Final = tuple(DENSE_RANGES)
 
 #: Least inverse depth whose inverse is a swept pixel's depth, 1/m. Source: derived, beyond any depth.
-MIN_INVERSE_DEPTH: Final = 1e-9
+MIN_SWEPT_INVERSE_DEPTH: Final = 1e-9
 
 
 class SelectedViews(NamedTuple):
@@ -316,7 +316,7 @@ def _gate_kernel(*tensors: Tensor, options: DenseOptions) -> tuple[Tensor, ...]:
     parts = [torch.empty_like(maps[0]) for _ in range(3)]
     limits = (
         *(options.min_correlation, options.max_sigma_rel, options.refuting_sigmas, options.refuting_ratio),
-        *(options.min_overlap_pixels, MIN_INVERSE_DEPTH),
+        *(options.min_overlap_pixels, MIN_SWEPT_INVERSE_DEPTH),
     )
     torch.ops.dhtorch.gate_map.default(*maps, *columns, *codes, *parts, *limits)
     return (*columns, *codes, *parts)
@@ -357,7 +357,7 @@ def _gated(
 ) -> DepthMap:
     """The swept map (B, h, w): depth, sigma and score of the fitted surface with their gates."""
     beyond, alone = place
-    depth = 1 / fitted.q.clamp_min(MIN_INVERSE_DEPTH)
+    depth = 1 / fitted.q.clamp_min(MIN_SWEPT_INVERSE_DEPTH)
     sigma_rel = (fitted.own + fitted.shared).sqrt() * depth.detach()
     untracked = ~known | ~fitted.seen | beyond | (fitted.correlation < options.min_correlation)
     uncertain = ~(sigma_rel <= options.max_sigma_rel) | ~alone

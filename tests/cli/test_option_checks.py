@@ -96,8 +96,8 @@ def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch)
     [
         (["enrich", "{}", "out=o"], "dhtorch.cli.enrich"),
         (["validate", "{}", "depth=d"], "dhtorch.cli.validate"),
-        (["align", "{}", "depth=d", "out=o"], "dhtorch.cli.align"),
-        (["complete", "{}", "out=o"], "dhtorch.cli.complete"),
+        pytest.param(["align", "{}", "depth=d", "out=o"], "dhtorch.cli.align", marks=pytest.mark.slow),
+        pytest.param(["complete", "{}", "out=o"], "dhtorch.cli.complete", marks=pytest.mark.slow),
         (["extract", "data=auto", "data.root={}", "out=o"], "dhtorch.extract"),
         (["{}"], "dhtorch.cli.process_capture"),
         (["run", "data=auto", "data.root={}"], "dhtorch.cli.job"),

@@ -253,7 +253,8 @@ def test_an_expression_fits_where_one_of_its_choices_does():
     assert not fits("GPL-3.0-only") and not fits("MIT AND GPL-3.0-only") and not fits("proprietary")
 
 
-def test_every_part_of_the_package_has_a_page_of_the_api():
+@pytest.mark.parametrize("some", [slice(0, None, 5), pytest.param(slice(0, None), marks=pytest.mark.slow)])
+def test_every_part_of_the_package_has_a_page_of_the_api(some):
     hooks = script("hooks")
-    for part in hooks.parts():
+    for part in list(hooks.parts())[some]:
         assert hooks.api_page(part).startswith(f"# {part}\n"), part

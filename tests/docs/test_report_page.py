@@ -26,6 +26,12 @@ from dhtorch.viz.plots.markup import Markup, escape_html, make_tag
 REPO = Path(__file__).resolve().parents[2]
 NAMES = [make.__name__ for make in archived.ALL]
 every = pytest.mark.parametrize("result", NAMES, indirect=True)
+#: Every third kind; the others among the slow tests.
+some = pytest.mark.parametrize(
+    "result",
+    [pytest.param(name, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, name in enumerate(NAMES)],
+    indirect=True,
+)
 
 
 @functools.cache
@@ -112,7 +118,7 @@ def test_several_results_stand_on_one_page_in_their_order():
 HOSTILE = '</td><script>alert("&amp;")</script>\x00\x1b|\n`${x}` ]]> \ud800 é'
 
 
-@every
+@some
 def test_names_cannot_break_the_page(result):
     bad = copy.deepcopy(result)
     old = bad["rows"][0]["scene"]
@@ -141,7 +147,7 @@ def emptied(value, name=""):
     return None if isinstance(value, float) or name in ("n_candidates", "n_kept", "passes") else value
 
 
-@every
+@some
 def test_nulls_everywhere_are_shown_as_nothing(result):
     bare = {**result, "rows": [emptied(r) for r in result["rows"]]}
     bare["summary"] = {k: {**v, "value": None, "low": None, "high": None} for k, v in result["summary"].items()}

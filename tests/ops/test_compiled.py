@@ -470,9 +470,10 @@ def a_map_with_artefacts(hw, g):
     gate = torch.where(keep, Gate.ANSWER, Gate.NO_TRACK).int()
     columns = torch.where(keep, depth, torch.nan), torch.where(keep, 0.01 * depth, torch.nan), score
     swept = DepthMap(*columns, keep.int() * Source.SWEPT, gate)
-    near = torch.where(usable, 1.02 / seen, 0.0)
+    near = torch.where(usable, torch.tensor([1.02, 1.02, 1.08])[:, None, None] / seen, 0.0)
     returns = map_filters.SensorReturns(near, 0.01 * near, usable.float(), usable)
-    return swept, returns, seen + 0.01 * torch.rand(3, h, w, generator=g)
+    grey = torch.where(torch.tensor([False, False, True])[:, None, None], 0.5, seen)
+    return swept, returns, grey + 0.01 * torch.rand(3, h, w, generator=g)
 
 
 @needs_compiler
@@ -515,12 +516,13 @@ def test_gated_and_merged_maps_agree_up_to_a_root(loaded, monkeypatch):
         return low + (high - low) * torch.rand(4, 31, 23, generator=g)
 
     q = uniform(-0.01, 0.5)
-    own, shared = (1e-3 * uniform() * q.square() for _ in range(2))
+    scale = torch.tensor([1e-5, 1e-3, 1e-3, 1e-3])[:, None, None]
+    own, shared = (scale * uniform() * q.square() for _ in range(2))
     flags = [uniform() < share for share in (0.9, 0.95, 0.05, 0.9)]
     pair_gate = torch.tensor([0, Gate.NO_POSE, 0, 0], dtype=torch.int32)
     usable = (uniform() < 0.3) & (torch.arange(31 * 23).view(31, 23) < torch.tensor([999, 999, 999, 9])[:, None, None])
-    off = torch.tensor([1.0, 1.0, 1.6, 1.6])[:, None, None]
-    near = torch.where(usable, off * uniform(0.9, 1.1) / q.clamp_min(1e-3), 0.0)
+    off = torch.tensor([1.06, 1.0, 1.6, 1.6])[:, None, None]  # the first within the ratio, beyond the sigmas
+    near = torch.where(usable, off * uniform(0.99, 1.01) / q.clamp_min(1e-3), 0.0)
     options = replace(DenseOptions(), min_overlap_pixels=20, max_sigma_rel=0.04, min_correlation=0.1)
     surfaces = q, own, shared, uniform(), *flags, pair_gate, torch.tensor([0.01, 0.02, 0.0, 0.03])
     calls = counted(monkeypatch, "gate_map"), counted(monkeypatch, "merge_maps")

@@ -146,7 +146,7 @@ def run_into(words: Words, out: Path) -> int:
 
 @pytest.mark.parametrize(
     "command",
-    [pytest.param(name, marks=[] if name in ("enrich", "complete") else pytest.mark.slow) for name in WRITERS],
+    [pytest.param(name, marks=[] if name == "enrich" else pytest.mark.slow) for name in WRITERS],
 )
 def test_an_empty_or_shortened_output_counts_as_missing(
     command: str, robot: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

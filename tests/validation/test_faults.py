@@ -65,9 +65,16 @@ def planted(frames, spoilt, own):
     return [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
 
 
-@pytest.mark.parametrize(
-    ("name", "own"), [(name, own) for name in FAULTS for own in (True, False) if (name, own) != ("inverse", True)]
-)
+#: Every fault, one in the capture's own depth and the next in maps that are given; the other half among the slow tests.
+PLANTED = [
+    pytest.param(name, own, marks=[pytest.mark.slow] * (k % 2 == own))
+    for k, name in enumerate(FAULTS)
+    for own in (True, False)
+    if (name, own) != ("inverse", True)
+]
+
+
+@pytest.mark.parametrize(("name", "own"), PLANTED)
 def test_a_planted_fault_is_named(name, own, frames, watched):
     kind, plant = FAULTS[name]
     spoilt = [plant(frame.depth) for frame in frames]
@@ -86,7 +93,7 @@ def panned():
     return shown, track_window(shown, METHOD)
 
 
-@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("own", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("late", "name"), [(3, "3 frames late"), (-3, "3 frames early")])
 def test_maps_that_come_late_or_early_are_named_by_how_much(late, name, own, panned):
     frames, watched = panned
