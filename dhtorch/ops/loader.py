@@ -13,8 +13,8 @@ reference, which the tests check (``tests/ops/test_compiled.py``):
   rounding of their sums;
 - up to the rounding of sums over a window, of the search for points and the registration of windows: half of the
   positions are equal or within 1e-4 px, 99 of 100 within a tenth of their sigma, at most one validity in 200 differs;
-- poses: 99 of 100 within a hundredth of their sigma; fitted surfaces: 99 of 100 depths within a tenth of their sigma,
-  at most one gate in 200 differs.
+- poses: 99 of 100 within a hundredth of their sigma; fitted surfaces and filled planes: 99 of 100 depths within a tenth
+  of their sigma, at most one gate in 200 differs.
 
 A library is one file of one vector level (:data:`LEVELS`), chosen by the level that torch itself uses, and works with
 any torch that has the stable ABI. Its name has a hash of its sources and its manifest (``.json``) the file's checksum:
@@ -59,7 +59,7 @@ SOURCES = tuple(
     FOLDER / f"{part}.cpp"
     for part in (
         *("sweep", "search", "affine", "pyramid", "fit", "windows"),
-        *("tokens", "pose", "tracks", "lens", "linear", "parallax", "filters"),
+        *("tokens", "pose", "tracks", "lens", "linear", "parallax", "filters", "planes"),
     )
 )
 

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +27,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.geometry.checks import any_possible, is_static
 from dhtorch.geometry.linalg import quadratic_form
 from dhtorch.geometry.windows import window_extreme
+from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns
 from dhtorch.records import DepthMap
@@ -90,6 +92,31 @@ class _Planes(NamedTuple):
         return 1 / self.n.clamp_min(1) + quadratic_form(x - self.x_0, y - self.y_0, *self.inverse)
 
 
+#: Fields of a map that a filled pixel changes. Source: derived, all but what its sigma is made of.
+_MAPS = ("depth", "sigma", "score", "source", "gate")
+
+#: Dtypes that the kernel reads, of the maps before and after the filters, returns, grey image and reach.
+_FILL_DTYPES: dict[str, torch.dtype | tuple[torch.dtype, ...]] = {
+    **{
+        f"{map_}_{name}": torch.int32 if name in ("source", "gate") else torch.float32
+        for map_ in ("swept", "support")
+        for name in _MAPS
+    },
+    **{f"returns_{name}": torch.float32 for name in ("depth", "sigma", "confidence")},
+    "usable": torch.bool,
+    "grey": torch.float32,
+    "reach": torch.float32,
+}
+
+#: Options that the kernel reads, in its order.
+_KERNEL_OPTIONS = (
+    *("plane_cell_px", "min_cell_pixels", "plane_ray_support", "min_plane_support", "plane_neighbours"),
+    *("plane_grey_difference", "plane_inlier_ratio", "min_triple_area", "min_plane_share", "max_plane_sigma_rel"),
+    *("max_plane_disagreement", "max_plane_difference", "max_refuted_rays", "independent_support"),
+    *("common_sigma_ratio", "max_sigma_rel"),
+)
+
+
 def fill_planes(
     swept: DepthMap,
     support: DepthMap,
@@ -120,10 +147,43 @@ def fill_planes(
     Gradient: of filled depths to the depths of their support; its selection and sigma carry none.
     Cost: linear in pixels; independent of the number of planes and source views.
     """
+    dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
+    reach = torch.where(dense, options.plane_reach * reach, 0.0).to(swept.depth)
+    maps = (getattr(each, name) for each in (swept, support) for name in _MAPS)
+    return swept.replace(**dict(zip(_MAPS, _filled(*maps, *returns, grey, reach, options=options), strict=True)))
+
+
+@cache
+def _tables(reach_cells: int, ray_support: int) -> list[Tensor]:
+    """:func:`_steps` (directions, cells, 2) and :func:`_triples` (hypotheses, 3) as int32."""
+    return [torch.tensor(x, dtype=torch.int32) for x in (_steps(reach_cells), _triples(ray_support))]
+
+
+def _fill_kernel(*tensors: Any, options: DenseOptions) -> list[Tensor]:
+    filled = [x.clone(memory_format=torch.contiguous_format) for x in tensors[: len(_MAPS)]]
+    known = (x.contiguous() for x in tensors[len(_MAPS) :])
+    depth, sigma, _, _, gate, returned, returned_sigma, _, usable, grey, reach = known
+    torch.ops.dhtorch.fill_planes.default(
+        *(depth, sigma, gate, returned, returned_sigma, usable, grey, reach),
+        *_tables(options.plane_reach_cells, options.plane_ray_support),
+        *filled,
+        *(getattr(options, name) for name in _KERNEL_OPTIONS),
+        MIN_PLANE_INVERSE_DEPTH,
+    )
+    return filled
+
+
+@operator(kernel=_fill_kernel, dtypes=_FILL_DTYPES, any_layout=tuple(_FILL_DTYPES))
+def _filled(*tensors: Any, options: DenseOptions) -> list[Tensor]:
+    """:func:`fill_planes` of the tensors of maps, returns, grey image and reach (0 where returns are sparse)."""
+    n = len(_MAPS)
+    swept, support = (DepthMap(*fields) for fields in (tensors[:n], tensors[n : 2 * n]))
+    returns = SensorReturns(*tensors[2 * n : -2])
+    grey, reach = tensors[-2:]
     has_sweep = support.keep.flatten(1).any(1)[:, None, None]
     unanswered = has_sweep & ~swept.keep & ~returns.usable
     if not any_possible(unanswered):
-        return swept
+        return list(tensors[:n])
     cells = _cells(*_known(support, returns), grey[:, 0].detach().to(swept.depth), options)
     with torch.no_grad():
         slots = _support_slots(cells, options)
@@ -131,8 +191,6 @@ def fill_planes(
     supports = _take(cells, slots, middle)
     planes = _fit_planes(supports, _wanted(unanswered, options), options)
     accepted, disagreement = _tested(planes, supports, cells.answered.shape, options)
-    dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
-    reach = torch.where(dense, options.plane_reach * reach, 0.0).to(swept.depth)
     accepted &= ~_is_refuted(planes, supports, reach, options).view(accepted.shape)
     q, relative = _at_pixels(planes, disagreement, swept.depth.shape, cells.answered.shape, options)
     accepted = _per_pixel(accepted, swept.depth.shape, options)
@@ -195,6 +253,15 @@ def _cell_middles(cells: _Cells, options: DenseOptions) -> tuple[Tensor, Tensor]
     return columns.expand(len(rows), -1).flatten(), rows[:, None].expand(-1, len(columns)).flatten()
 
 
+def _steps(reach_cells: int) -> list[list[tuple[int, int]]]:
+    """Rows and columns from a cell to those on each of its rays, from the nearest."""
+    angles = (2 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS))
+    return [
+        [(round(r * math.sin(angle)), round(r * math.cos(angle))) for r in range(1, reach_cells + 1)]
+        for angle in angles
+    ]
+
+
 def _support_slots(cells: _Cells, options: DenseOptions) -> Tensor:
     """Flat indices (B, S, N) of the support of every cell, ray by ray from the nearest; -1 where there is none."""
     reach, per_ray = options.plane_reach_cells, options.plane_ray_support
@@ -205,13 +272,12 @@ def _support_slots(cells: _Cells, options: DenseOptions) -> Tensor:
     grey = F.pad(cells.grey, margin, value=torch.inf)
     answered = F.pad(cells.answered, margin)
     rays = []
-    for k in range(_DIRECTIONS):
-        angle = 2 * math.pi * k / _DIRECTIONS
+    for steps in _steps(reach):
         support = torch.full((per_ray, *cells.q.shape), -1, dtype=torch.int32, device=cells.q.device)
         count = torch.zeros_like(cells.answered, dtype=torch.int32)
         open_ = torch.ones_like(cells.answered)
-        for r in range(1, reach + 1):
-            top, left = (reach + round(r * f(angle)) for f in (math.sin, math.cos))
+        for down, right in steps:
+            top, left = reach + down, reach + right
             place = slice(None), slice(top, top + rows), slice(left, left + columns)
             open_ = open_ & ((grey[place] - cells.grey).abs() <= options.plane_grey_difference)
             take = open_ & answered[place]
@@ -416,12 +482,12 @@ def _per_pixel(x: Tensor, shape: torch.Size, options: DenseOptions) -> Tensor:
     return x.repeat_interleave(side, 1).repeat_interleave(side, 2)[:, : shape[1], : shape[2]]
 
 
-def _answer(swept: DepthMap, where: Tensor, depth: Tensor, relative: Tensor) -> DepthMap:
-    """The map with depths (B, h, w) of relative sigma ``relative`` ``where`` (B, h, w) bool."""
-    return swept.replace(
-        depth=torch.where(where, depth, swept.depth),
-        sigma=torch.where(where, relative * depth.detach(), swept.sigma),
-        score=torch.where(where, 0.1 / (0.1 + relative), swept.score),
-        source=swept.source.masked_fill(where, Source.FILLED),
-        gate=swept.gate.masked_fill(where, Gate.ANSWER),
-    )
+def _answer(swept: DepthMap, where: Tensor, depth: Tensor, relative: Tensor) -> list[Tensor]:
+    """The map with depths (B, h, w) of relative sigma ``relative`` ``where`` (B, h, w) bool: its fields ``_MAPS``."""
+    return [
+        torch.where(where, depth, swept.depth),
+        torch.where(where, relative * depth.detach(), swept.sigma),
+        torch.where(where, 0.1 / (0.1 + relative), swept.score),
+        swept.source.masked_fill(where, Source.FILLED),
+        swept.gate.masked_fill(where, Gate.ANSWER),
+    ]

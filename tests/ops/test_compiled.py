@@ -45,8 +45,8 @@ from dhtorch.geometry.map_estimate import estimate_noise_variance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import builder, constants, dispatch, loader
-from dhtorch.pipeline import dense, map_filters, surface
-from dhtorch.pipeline.dense_options import DenseOptions
+from dhtorch.pipeline import dense, map_filters, planes, surface
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.pair import merge, undistort_tracks
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.records import NO_HINT, DepthMap, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
@@ -76,12 +76,13 @@ def unused(monkeypatch, tmp_path):
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):
     """A folder with the compiled file; one of a process, in which operations are registered once. The library of the
-    user's cache, named after the sources, is copied where it is sound, and compiled otherwise."""
+    user's cache, named after the sources, is linked where it is sound, so that other tests of the process may load it
+    too, and compiled otherwise."""
     folder = tmp_path_factory.mktemp("cache")
-    built = loader.library()
+    built = loader.library().resolve()
     if built.is_file() and loader.problem(built) is None:
         for path in (built, loader.manifest(built)):
-            shutil.copy2(path, folder)
+            (folder / path.name).symlink_to(path)
         return folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DHTORCH_CACHE", str(folder))
@@ -544,6 +545,134 @@ def test_gated_and_merged_maps_agree_up_to_a_root(loaded, monkeypatch):
 
 def returns_of(returns, k):
     return map_filters.SensorReturns(*(x[[k]] for x in returns))
+
+
+def weakly_textured(hw, seed=0, B=3):
+    """Arguments of fill_planes: views of two slanted surfaces of several grey values, a quarter answered with noise and
+    outliers, holes, and returns on one side; of the second view the sensor reaches far, and the last has no sweep."""
+    g = torch.Generator().manual_seed(seed)
+    v, u = torch.meshgrid(*(torch.arange(n).float() for n in hw), indexing="ij")
+    slope = torch.tensor([1.0, -0.7, 0.4])[:B, None, None] * 4e-4
+    q = 0.35 + slope * (u - hw[1] / 2) - 3e-4 * (v - hw[0] / 2)
+    q = torch.where(u + 0.3 * v < 0.7 * hw[1], q, 0.75 * q)
+    depth = (1 + 0.02 * torch.randn(B, *hw, generator=g)) / q
+    depth = torch.where(torch.rand(B, *hw, generator=g) < 0.04, 1.5 * depth, depth)
+    depth[:, ::17, ::5], depth[:, ::13, ::7] = torch.inf, -1.0
+    patches = torch.rand(B, -(-hw[0] // 24), -(-hw[1] // 32), generator=g)
+    grey = 0.4 + 0.09 * patches.repeat_interleave(24, 1).repeat_interleave(32, 2)[:, : hw[0], : hw[1]]
+    answered = torch.rand(B, *hw, generator=g) < 0.6
+    hole = (u - 0.6 * hw[1]).abs() < 0.1 * hw[1]
+    hole = hole | ((v - 0.3 * hw[0]).abs() < 0.12 * hw[0]) & (u > 0.2 * hw[1])
+    support = answered & ~hole
+    swept = support & (torch.rand(B, *hw, generator=g) < 0.7)
+    if B > 2:
+        swept[2] = support[2] = False
+    sigma = 0.02 * depth * (0.5 + torch.rand(B, *hw, generator=g))
+
+    def filtered(keep):
+        nan = torch.full_like(depth, torch.nan)
+        code = torch.where(keep, Source.SWEPT, Source.NONE).int()
+        gate = torch.where(keep, codes.Gate.ANSWER, codes.Gate.NO_TRACK).int()
+        return DepthMap(torch.where(keep, depth, nan), torch.where(keep, sigma, nan), 0.8 * keep, code, gate)
+
+    usable = (u < 0.3 * hw[1]) & (torch.rand(B, *hw, generator=g) < 0.5)
+    returns = map_filters.SensorReturns(1.01 / q, 0.01 / q, torch.ones_like(q), usable)
+    reach = torch.tensor([0.5, 3.2, 3.0])[:B]
+    return filtered(swept), filtered(support), returns, grey[:, None], reach
+
+
+PLANE_OPTIONS = {
+    "as they are": {},
+    "loose": {
+        "max_plane_disagreement": 1.0,
+        "min_plane_share": 0.1,
+        "max_plane_sigma_rel": 0.05,
+        "max_refuted_rays": 1.0,
+        "max_plane_difference": 0.1,
+        "max_sigma_rel": 0.5,
+    },
+    "small cells": {
+        "plane_cell_px": 5,
+        "min_cell_pixels": 3,
+        "plane_reach_cells": 9,
+        "plane_ray_support": 2,
+        "min_plane_support": 8,
+        "plane_neighbours": 1,
+        "min_triple_area": 2.0,
+        "max_plane_sigma_rel": 0.03,
+    },
+    "strict": {
+        "plane_grey_difference": 0.04,
+        "plane_inlier_ratio": 0.06,
+        "min_plane_support": 30,
+        "independent_support": 0.1,
+        "common_sigma_ratio": 0.8,
+        "plane_reach": 0.8,
+        "max_sigma_rel": 0.022,
+    },
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("options", PLANE_OPTIONS.values(), ids=PLANE_OPTIONS)
+@pytest.mark.parametrize("hw", [(150, 203), (97, 240)])
+def test_filled_planes_agree_up_to_rounding(loaded, monkeypatch, hw, options):
+    views, calls = weakly_textured(hw), counted(monkeypatch, "fill_planes")
+    options = replace(DEFAULT_DENSE_OPTIONS, **options)
+    sparse = torch.tensor([False, False, True])
+    for given in (None, sparse, ~sparse):
+        ours, torchs = both_ways(
+            lambda given=given: planes.fill_planes(*views, sparse=given, options=options), monkeypatch
+        )
+        filled, expected = ours.source == Source.FILLED, torchs.source == Source.FILLED
+        both = filled & expected
+        assert expected[:2].flatten(1).sum(1).min() > 100 and not expected[2].any()
+        assert (filled != expected).sum() <= expected.sum() / 200
+        for name, limit in (("depth", 1e-3 * torchs.sigma), ("sigma", 1e-3 * torchs.sigma), ("score", 1e-3)):
+            difference = (getattr(ours, name) - getattr(torchs, name)).abs()
+            assert (difference <= limit)[both].float().mean() >= 0.99, name
+        for name in ("depth", "sigma", "score", "source", "gate"):
+            a, b = getattr(ours, name), getattr(views[0], name)
+            assert torch.equal(a[~filled].nan_to_num(7), b[~filled].nan_to_num(7)), name
+        assert not ours.gate[filled].any()
+    assert len(calls) == 3
+
+
+@needs_compiler
+@pytest.mark.parametrize("hw", [(64, 97), (5, 150), (3, 2), (0, 4)])
+def test_filled_planes_depend_on_no_other_view(loaded, monkeypatch, hw):
+    swept, support, returns, grey, reach = weakly_textured(hw)
+    calls = counted(monkeypatch, "fill_planes")
+    options = replace(DEFAULT_DENSE_OPTIONS, min_plane_support=6, max_plane_sigma_rel=0.1, max_sigma_rel=1.0)
+    together = planes.fill_planes(swept, support, returns, grey, reach, options=options)
+    assert hw[0] < 60 or (together.source == Source.FILLED).any()
+    for k in range(3):
+        one = slice(k, k + 1)
+        alone_returns = map_filters.SensorReturns(*(x[one] for x in returns))
+        alone = planes.fill_planes(swept[one], support[one], alone_returns, grey[one], reach[one], options=options)
+        for a, b in zip(tree_leaves(together[one]), tree_leaves(alone), strict=True):
+            assert torch.equal(a.nan_to_num(7), b.nan_to_num(7))
+    none = slice(0, 0)
+    empty = map_filters.SensorReturns(*(x[none] for x in returns))
+    assert planes.fill_planes(swept[none], support[none], empty, grey[none], reach[none]).depth.shape == (0, *hw)
+    assert len(calls) == 5
+
+
+@needs_compiler
+def test_planes_that_compiled_code_does_not_fill_are_torchs(loaded, monkeypatch):
+    swept, support, returns, grey, reach = weakly_textured((97, 240), B=1)
+    calls = counted(monkeypatch, "fill_planes")
+    options = replace(DEFAULT_DENSE_OPTIONS, **PLANE_OPTIONS["loose"])
+    leaf = support.depth.clone().requires_grad_()
+    filled = planes.fill_planes(swept, support.replace(depth=leaf), returns, grey, reach, options=options)
+    where = filled.source == Source.FILLED
+    assert where.any() and torch.autograd.grad(filled.depth[where].sum(), [leaf])[0].abs().sum() > 0
+    double = swept.replace(depth=swept.depth.double(), sigma=swept.sigma.double(), score=swept.score.double())
+    assert planes.fill_planes(double, support, returns, grey, reach, options=options).depth.dtype == torch.float64
+    assert not calls
+    mirrored = map_filters.SensorReturns(*(x.flip(-1).contiguous().flip(-1) for x in returns))
+    expanded = planes.fill_planes(swept, support, mirrored, grey, reach, options=options)
+    assert calls and torch.equal(expanded.gate, filled.gate)
 
 
 @needs_compiler
