@@ -104,11 +104,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "ops.csrc.planes": [
         ("add", "(depth <= std::numeric_limits<float>::max())", "(depth == depth)"),
-        ("add", "silent & ~has ? one", "silent ? one"),
+        ("is_unanswered", " && !usable[pixel]", ""),
         ("add", "has ? first<Vector>(of.returned_sigma + at, n) : ", ""),
         ("read", "std::min((column + 1) * side, of.w)", "(column + 1) * side"),
         ("read", "sum[0] >= static_cast<float>(min_pixels)", "sum[0] > static_cast<float>(min_pixels)"),
-        ("trace", "count < options.ray_support", "count < reach"),
+        ("trace", "if (cells.answered[m])", "if (r % reach < 9 && cells.answered[m])"),
         ("trace", "k * options.ray_support + count++", "total + count++"),
         ("take", "cells.v[m] - down", "cells.v[m] + down"),
         ("hypothesis", "(dx * eq - dq * ex) / area", "(dx * eq + dq * ex) / area"),

@@ -548,8 +548,9 @@ def returns_of(returns, k):
 
 
 def weakly_textured(hw, seed=0, B=3):
-    """Arguments of fill_planes: views of two slanted surfaces of several grey values, a quarter answered with noise and
-    outliers, holes, and returns on one side; of the second view the sensor reaches far, and the last has no sweep."""
+    """Arguments of fill_planes: views of two slanted surfaces of several grey values, answered in part or, on the right,
+    as a whole, with noise, outliers, holes, and returns on the left; the second sensor reaches far, the last view has
+    no sweep."""
     g = torch.Generator().manual_seed(seed)
     v, u = torch.meshgrid(*(torch.arange(n).float() for n in hw), indexing="ij")
     slope = torch.tensor([1.0, -0.7, 0.4])[:B, None, None] * 4e-4
@@ -560,11 +561,12 @@ def weakly_textured(hw, seed=0, B=3):
     depth[:, ::17, ::5], depth[:, ::13, ::7] = torch.inf, -1.0
     patches = torch.rand(B, -(-hw[0] // 24), -(-hw[1] // 32), generator=g)
     grey = 0.4 + 0.09 * patches.repeat_interleave(24, 1).repeat_interleave(32, 2)[:, : hw[0], : hw[1]]
-    answered = torch.rand(B, *hw, generator=g) < 0.6
+    whole = u > 0.72 * hw[1]
+    answered = whole | (torch.rand(B, *hw, generator=g) < 0.6)
     hole = (u - 0.6 * hw[1]).abs() < 0.1 * hw[1]
     hole = hole | ((v - 0.3 * hw[0]).abs() < 0.12 * hw[0]) & (u > 0.2 * hw[1])
     support = answered & ~hole
-    swept = support & (torch.rand(B, *hw, generator=g) < 0.7)
+    swept = support & (whole | (torch.rand(B, *hw, generator=g) < 0.7))
     if B > 2:
         swept[2] = support[2] = False
     sigma = 0.02 * depth * (0.5 + torch.rand(B, *hw, generator=g))
@@ -585,7 +587,7 @@ PLANE_OPTIONS = {
     "as they are": {},
     "loose": {
         "max_plane_disagreement": 1.0,
-        "min_plane_share": 0.1,
+        "min_plane_share": 0.9,
         "max_plane_sigma_rel": 0.05,
         "max_refuted_rays": 1.0,
         "max_plane_difference": 0.1,
