@@ -269,3 +269,14 @@ def test_the_fit_is_least_squares_with_its_covariance():
         here, there = (torch.full((1, 7), float(v)).double() for v in at[:2])
         torch.testing.assert_close(got.at(here, there)[0, k], at @ expected)
         torch.testing.assert_close(got.leverage(here, there)[0, k], at @ torch.linalg.inv(rows.T @ rows) @ at)
+
+
+def test_the_best_hypothesis_is_the_plane_of_most_support():
+    g = torch.Generator().manual_seed(6)
+    x, y = (40 * torch.randn(1, 64, 7, generator=g) for _ in range(2))
+    on_plane = torch.arange(64)[:, None].expand(1, 64, 7) % 3 > 0
+    q = (0.4 + 4e-4 * x - 1e-3 * y) * torch.where(on_plane, 1.0, 1.5)
+    support = planes._Support(x, y, q, torch.zeros_like(q), torch.ones_like(on_plane))
+    wanted = torch.arange(7)[None] < 5
+    inlier = planes._best_hypothesis(support, wanted, DEFAULT_DENSE_OPTIONS)
+    assert torch.equal(inlier, on_plane & wanted[:, None])
