@@ -73,7 +73,8 @@ struct Cells {
     const Vector zero = {}, one = zero + 1.0f;
     const Bits silent = first<Bits>(of.gate + at, n) != GATE_ANSWER, keep = first<Bits>(of.swept_gate + at, n) == GATE_ANSWER,
                has = __builtin_convertvector(first<Bytes>(of.usable + at, n), Bits) != 0;
-    const Vector swept = first<Vector>(of.swept + at, n), depth = has ? first<Vector>(of.returned + at, n) : keep ? swept : zero;
+    const Vector swept = first<Vector>(of.swept + at, n), returned = first<Vector>(of.returned + at, n);
+    const Vector depth = has ? returned : keep ? swept : zero;
     const Vector deviation = has ? first<Vector>(of.returned_sigma + at, n) : first<Vector>(of.swept_sigma + at, n);
     const Bits known = (depth > 0.0f) & (depth <= std::numeric_limits<float>::max());
     const Vector q = one / (known ? depth : one), ratio = deviation / (known ? depth : one);
@@ -153,10 +154,10 @@ struct Planes {
 // The plane of one cell, with its tests.
 struct Plane {
   float q_0, x_0, y_0, a, b, n, xx, xy, yy, residual, common;
-  float q;      // in the middle of the cell
-  bool enough;  // support
-  bool holds;   // but for its disagreement with the planes around
-  bool fitted;
+  float q = 0;          // in the middle of the cell
+  bool enough = false;  // support
+  bool holds = false;   // but for its disagreement with the planes around
+  bool fitted = false;
 
   float at(float x, float y) const { return q_0 + a * (x - x_0) + b * (y - y_0); }
   float leverage(float x, float y) const {
