@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -74,6 +75,25 @@ def test_another_allocator_is_left_alone(monkeypatch):
 
     monkeypatch.setattr(ctypes, "CDLL", missing)
     assert allocator.disable_malloc_trim() is False
+
+
+def test_both_thresholds_are_set_and_none_where_the_environment_sets_one(monkeypatch):
+    names = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TOP_PAD_", "GLIBC_TUNABLES")
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    calls, refused = [], []
+    library = SimpleNamespace(mallopt=lambda *call: calls.append(call) or int(call[0] not in refused))
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: library)
+    assert allocator.disable_malloc_trim() is True
+    assert calls == [(-3, 2**30), (-1, 2**30)], "M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h, bytes"
+    for option in (-1, -3):
+        refused[:] = [option]
+        assert allocator.disable_malloc_trim() is False
+    calls.clear()
+    for name in names:
+        with monkeypatch.context() as environment:
+            environment.setenv(name, "131072")
+            assert allocator.disable_malloc_trim() is False and not calls, name
 
 
 @pytest.mark.slow

@@ -251,6 +251,8 @@ def test_unfinished_private_files_of_a_dead_process_are_removed_by_the_next(tmp_
         (folder / ".shard.parquet.0123.tmp").write_bytes(b"half")
         (folder / "shard.parquet").write_bytes(b"whole")
     (out / PRIVATE_FOLDER / "link").symlink_to(elsewhere)
+    with open_output_folder(out, "out"):
+        assert not [*(out / PRIVATE_FOLDER).glob("shards/*.tmp")], "before the run writes"
     write(out, a=b"new")
     left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.tmp")}
     assert left == {"elsewhere/.shard.parquet.0123.tmp", "out/.shard.parquet.0123.tmp"}, "of others"
