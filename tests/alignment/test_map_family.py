@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from dhtorch.alignment.align import align_depth
-from dhtorch.alignment.map_family import MAP_FAMILIES, find_map_family
+from dhtorch.alignment.map_family import MAP_FAMILIES, find_map_family, least_absolute_line
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
 from dhtorch.alignment.references import MetricReferences
 from dhtorch.codes import Gate
 from dhtorch.records import Samples
@@ -57,8 +58,17 @@ def test_maps_that_rise_with_depth_are_of_depth(depth, change, noise):
 def test_without_range_or_returns_nothing_is_found(depth):
     wall = 1.5 + 0.01 * depth
     assert family(1 / wall, wall, noise=0.005) == [DEPTH], "a line describes it to the returns' noise"
+    assert family(1 / wall, wall) == [DEPTH], "a line describes it to 1e-5, far below the least error"
     few = torch.arange(depth.shape[1])[None] < 40
     assert family(1 / depth, depth, near=few) == [DEPTH] and family(1 / depth, depth) == [DISPARITY]
+
+
+def test_a_line_of_least_absolute_error_passes_by_gross_outliers():
+    x = torch.linspace(0, 1, 41, dtype=torch.float64)[None]
+    y = 2 * x + 1
+    y[:, 5::6] *= 0.5  # 6 of 41
+    line, ok = least_absolute_line(x, y, torch.ones_like(x), DEFAULT_ALIGNMENT_OPTIONS)
+    assert ok.all() and torch.allclose(line, torch.tensor([[2.0, 1.0]], dtype=torch.float64), atol=0.05)
 
 
 def test_every_map_of_a_batch_has_a_family_of_its_own(depth):
