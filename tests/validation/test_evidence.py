@@ -70,6 +70,14 @@ def test_answers_that_disagree_are_as_unsure_as_they_disagree():
     middle = 0.5 * (math.log(2 / 1.2) + math.log(2 / 1.9))
     spread = 0.5 * (math.log(2 / 1.2) - math.log(2 / 1.9))
     assert apart.misfit[0, 10, 12] == pytest.approx(middle / math.sqrt(0.01**2 + 0.02**2 + spread**2), rel=1e-3)
+    assert alike.sure[0, 10, 12] and not apart.sure[0, 10, 12]
+
+
+def test_a_reference_counts_on_its_own_surface_of_the_map():
+    step = torch.ones(1, *HW)
+    step[..., 16:] = 3.0
+    found = sparse_evidence(step, HW, told([[15, 10]], 1.0), 0.02).misfit
+    assert found[0, 10, 14] == found[0, 10, 15] == 0 and found[..., 16:].isnan().all()
 
 
 def test_a_reference_is_as_unsure_as_the_map_is_loose_there():
@@ -102,7 +110,8 @@ def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
 
 
 def test_of_several_views_the_mildest_counts(monkeypatch):
-    said = {0: 5.0, 1: -2.0, 2: 4.0}
+    said = {0: 5.0, 1: -2.0, 2: 4.0, 3: 0.5}
+    unused = torch.tensor([False])
     base, source_view = a_view((0.1, 0, 0))
     flat = torch.full((1, *HW), 2.0)
     monkeypatch.setattr(
@@ -110,7 +119,8 @@ def test_of_several_views_the_mildest_counts(monkeypatch):
         "_view_evidence",
         lambda q, base, p, tolerance, options: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0),
     )
-    found = photometric_evidence(flat, base, [source_view._replace(fit=k) for k in said], 0.02)
+    views = [source_view._replace(fit=k) for k in range(3)] + [source_view._replace(fit=3, use=unused)]
+    found = photometric_evidence(flat, base, views, 0.02)
     assert (found.misfit == -2).all()
     assert (found.view == 1).all()
 

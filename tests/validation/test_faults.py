@@ -16,12 +16,15 @@ from dhtorch.validation.faults import (
     NO_FAULT,
     TRACKING_METHOD,
     UNIT_FACTORS,
+    FaultWindow,
+    SampleLosses,
     WindowTracks,
     diagnose,
     ray_lengths,
     rot90_map,
     select_cause,
     track_window,
+    undo_fault,
 )
 from dhtorch.validation.options import ValidationOptions
 
@@ -265,6 +268,30 @@ def test_an_explanation_must_be_clear_and_alone():
     assert select_cause(losses(mirror=torch.tensor([0.9, -0.3] * 4))).cause is None, "some pairs only"
     few = {name: torch.cat([x[:3], torch.full((5,), torch.nan)]) for name, x in losses(mirror=0.2).items()}
     assert select_cause(few).cause is None, "too few pairs tell"
+
+
+def test_a_fault_is_compared_over_samples_with_depth_under_both_hypotheses(monkeypatch):
+    """Four groups of ten samples: without a fault the first three have a depth, with it undone the last three."""
+
+    def losses(of_ten, used, *, defined=True):
+        tens = torch.tensor([of_ten, used]).repeat_interleave(10, 1)
+        return SampleLosses(tens[:1], tens[1:] > 0, torch.tensor([defined]))
+
+    base, undone = losses([0.2, 0.4, 0.6, 1.0], [1, 1, 1, 0]), losses([1.0, 0.1, 0.1, 0.9], [0, 1, 1, 1])
+    assert base.mean().tolist() == pytest.approx([0.4])
+    assert losses([0.2, 0.4, 0.6, 1.0], [1, 1, 1, 0], defined=False).mean().isnan().all()
+    window = FaultWindow(*[None] * 9)
+    monkeypatch.setattr(FaultWindow, "sample_losses", lambda self, cause: undone)
+    assert window.comparable_loss(KNOWN_FAULTS[0], base).tolist() == pytest.approx([0.4 + 0.1 - 0.5], abs=1e-6)
+
+
+def test_a_distance_along_the_ray_is_divided_by_the_length_of_the_ray(frames):
+    camera = cam.resize(frames[0].camera, (180, 240), (90, 120))
+    column, row = 110, 7
+    x, y = (torch.tensor([column, row]) - camera.c[0]) / camera.f[0]
+    cause = next(cause for cause in KNOWN_FAULTS if cause.ray)
+    undone = undo_fault(torch.full((1, 90, 120), 2.0), cause, frames[0].replace(depth_camera=None))
+    assert float(undone[0, row, column]) == pytest.approx(2 / float(1 + x**2 + y**2) ** 0.5, rel=1e-5)
 
 
 def test_options_change_what_they_name(frames, still):
