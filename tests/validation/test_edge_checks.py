@@ -1,14 +1,16 @@
 """Edges of pictures and depth show by how many frames depth is late, and how it is turned; sound windows show nothing."""
 
 import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
 from support.cluttered_walk import N, walk
 
 from dhtorch.data.orientation import edge_correlations
+from dhtorch.validation import edge_lag
 from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
-from dhtorch.validation.edge_lag import _SHIFTS_PX, EdgeLag, _shifted_scores, find_edge_lag
+from dhtorch.validation.edge_lag import _SHIFTS_PX, EdgeLag, _shifted_scores, clear_lead, find_edge_lag
 from dhtorch.validation.faults import KNOWN_FAULTS, rot90_map
 
 
@@ -31,6 +33,29 @@ def test_sound_windows_show_nothing(frames):
 def test_a_lag_is_found(lag, frames):
     shown = find_edge_lag(delayed(frames, lag))
     assert shown.lag == lag and shown.lead > 0.04
+
+
+@pytest.mark.parametrize(("n", "lag", "expected"), [(8, 2, 0.1), (7, 3, 0.1), (7, -3, 0.1), (6, 3, 0.0), (6, -3, 0.0)])
+def test_the_lead_of_a_lag_is_its_correlation_less_that_without_over_four_frames_or_more(monkeypatch, n, lag, expected):
+    scores = torch.linspace(0.2, 0.5, n)[:, None].expand(n, n).clone()  # of picture i and the depth of frame j
+    for i in range(n):
+        scores[i, i + lag : i + lag + 1 if i + lag >= 0 else 0] += 0.1
+    monkeypatch.setattr(edge_lag, "picture_edges", lambda image, grid_px: image.expand(3, 2, 2))
+    monkeypatch.setattr(edge_lag, "depth_over_picture", lambda frame, depth: frame.image[0])
+    monkeypatch.setattr(edge_lag, "depth_edges", lambda depth, hw: (depth.expand(3, *hw), torch.ones(hw) > 0))
+    monkeypatch.setattr(edge_lag, "edge_correlations", lambda pictures, edges, covered: scores)
+    of_two = lambda picture, edges, covered: scores[int(picture[0, 0, 0]), int(edges[0, 0, 0])].expand(1)  # noqa: E731
+    monkeypatch.setattr(edge_lag, "_shifted_scores", of_two)
+    found = find_edge_lag([SimpleNamespace(image=torch.full((1, 1, 1, 1), float(k)), depth=None) for k in range(n)])
+    assert found.lag == (lag if expected else 0) and found.lead == pytest.approx(expected)
+
+
+def test_a_lead_is_above_the_least_and_above_its_standard_errors():
+    assert (
+        clear_lead(torch.full((4,), 0.1), 0.05) == pytest.approx(0.1) and clear_lead(torch.full((4,), 0.04), 0.05) == 0
+    )
+    apart = torch.tensor([0.0, 0.2, 0.0, 0.2])  # mean 0.1, standard error 0.1155 / 2
+    assert clear_lead(apart, 0.05, errors=1.7) == pytest.approx(0.1) and clear_lead(apart, 0.05, errors=1.8) == 0
 
 
 def test_correlations_under_shifts_are_those_of_shifted_depth():
