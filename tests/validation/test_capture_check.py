@@ -16,8 +16,13 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
-from dhtorch.records import Pose
+from dhtorch.geometry.camera import Camera
+from dhtorch.records import Frame, Pose
+from dhtorch.validation import capture_check, picture_field
 from dhtorch.validation.capture_check import CaptureCheck, Finding, check_capture
+from dhtorch.validation.faults import KNOWN_FAULTS
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
+from dhtorch.validation.picture_field import PictureField
 
 ROOT = Path(os.environ.get("DHTORCH_DATA", "nowhere"))
 needs_data = pytest.mark.skipif(not ROOT.is_dir(), reason="no DHTORCH_DATA")
@@ -247,6 +252,34 @@ def test_lines_and_words_of_findings():
     check = CaptureCheck(recording([None]), findings=(finding, Finding("scale", "far")))
     assert check.poses_refuted and check.lines == ["a remark", "wrong (remedy: data.x=1)", "far"]
     assert not CaptureCheck(recording([None]), findings=(Finding("scale", "far"),)).poses_refuted
+
+
+def test_a_fault_names_the_option_that_undoes_it():
+    fault = {fault.name: fault for fault in KNOWN_FAULTS}
+    remedy = {name: capture_check._fault_finding(fault[name]).remedy for name in fault}
+    assert remedy["mirrored left to right"] == "data.depth_turn=left_right"
+    assert remedy["mirrored upside down"] == "data.depth_turn=upside_down"
+    assert remedy["rolled by 180 degrees"] == "data.depth_turn=180"
+    late, early = (capture_check._fault_finding(fault[name]) for name in ("3 frames late", "2 frames early"))
+    assert late == Finding("time offset", "depth is 3 frames late against the pictures", "data.depth_lag=3")
+    assert early == Finding("time offset", "depth is 2 frames early against the pictures", "data.depth_lag=-2")
+
+
+def test_the_camera_of_a_crop_and_the_miss_of_returns_under_it():
+    stated = Camera(torch.tensor([[100.0, 110.0]]), torch.tensor([[49.5, 41.5]]))
+    crop = PictureField(2.0, (0.25, -0.125), loss=0.1, stated_loss=1.0, lead=0.5)
+    camera = crop.camera(stated, (80, 100))  # middle (49.5, 39.5), moved by (25, -10) px
+    assert camera.f.tolist() == [[200, 220]]
+    assert camera.c.tolist() == [[49.5 + 2 * (0 - 25), 39.5 + 2 * (2 + 10)]]
+    assert crop.differs and not crop._replace(zoom=1.05).differs and not crop._replace(lead=0.0).differs
+    frame = Frame(torch.zeros(1, 1, 80, 100), torch.full((1, 80, 100), 2.0), stated)
+    v, u = torch.meshgrid(torch.arange(20.0, 60, 4), torch.arange(20.0, 60, 4), indexing="ij")
+    uv = torch.stack((u, v), -1).view(1, -1, 2)
+    motion = Pose(torch.eye(3)[None], torch.tensor([[0.1, 0.0, 0.0]]))  # at 2 m and 100 px: 5 px to the right
+    pair = picture_field._Returns(frame, frame, uv, uv + torch.tensor([5.0, 0.0]), motion)
+    loss = picture_field._pair_loss(pair, torch.tensor([[1.0, 0.0, 0.0], [1.5, 0.0, 0.0]]))
+    half = DEFAULT_VALIDATION_OPTIONS.half_loss_px
+    assert loss.tolist() == pytest.approx([0.0, 16**2 / (16**2 + half**2)], abs=1e-5)  # 2.5 px of 100 are 16 of 640
 
 
 FIELD_CASES = {
