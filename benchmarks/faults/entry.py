@@ -234,7 +234,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("ExtendDepth.left_out", "self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))", "pass"),
         ("ExtendDepth._run_method", "torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK)", "estimate.gate"),
         ("ExtendDepth._compute_columns", "tokens_hw=self.tokens_hw, fit=self.fit", "tokens_hw=self.tokens_hw"),
-        ("_problem_codes", "return SampleProblem.UNREADABLE", "return SampleProblem.NONE"),
+        ("_problem_codes", "return SampleProblem.NO_DEPTH", "return SampleProblem.NONE"),
         ("_problem_codes", "if not has_returns:", "if has_returns:"),
         ("_problem_codes", "SampleProblem.NONE if paired", "SampleProblem.NONE if not paired"),
         ("ExtendDepth._run_method", '"hint": self.hint, ', ""),

@@ -392,6 +392,7 @@ class Declared(torch.utils.data.Dataset):
         ("float32", {"is_depth_map": True, "unit": "m"}, "mm", "m"),  # arrays stay as they are, in every version
         ("uint16", {"depth_unit": "mm"}, None, "mm"),
         ("video", {"is_depth_map": True}, None, None),  # 0.4 decodes it as a picture
+        ("video", {"is_depth_map": True, "depth_unit": "m"}, None, None),
         ("image", {"is_depth_map": True}, "mm", None),
         ("float32", None, "mm", None),
     ],

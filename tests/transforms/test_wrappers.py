@@ -20,6 +20,7 @@ from dhtorch.transforms import (
     RldsBatchTransform,
     SampleError,
     SampleProblem,
+    adapters,
     collate_kept,
     one_thread,
 )
@@ -218,13 +219,15 @@ def test_a_data_sets_own_collator_counts_them_where_it_skips():
     assert out["dhtorch.problem"].tolist()[1] == SampleProblem.UNREADABLE
 
 
-def test_one_thread_is_one_of_torch_and_of_opencv():
+def test_one_thread_is_one_of_torch_and_of_opencv(monkeypatch):
+    kept = []
+    monkeypatch.setattr(adapters, "disable_malloc_trim", lambda: kept.append("freed memory"))
     before = torch.get_num_threads(), cv2.getNumThreads()
     try:
         torch.set_num_threads(2)
         cv2.setNumThreads(2)
         one_thread(7)
-        assert torch.get_num_threads() == 1 and cv2.getNumThreads() == 1
+        assert torch.get_num_threads() == 1 and cv2.getNumThreads() == 1 and kept == ["freed memory"]
     finally:
         torch.set_num_threads(before[0])
         cv2.setNumThreads(before[1])
