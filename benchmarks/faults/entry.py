@@ -146,7 +146,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("SampleReader._row", "at if x.shape[1] > 1 else 0", "0"),
         ("intrinsic_rows", "x.ndim == 3 and T == 4 and ", "x.ndim == 3 and "),
         ("intrinsic_rows", "T == 4 and not all_known", "T == 4 and all_known"),
-        ("SampleReader.per_sample", "self.batched and len(x) == B", "len(x) == B"),
+        ("SampleReader.per_sample", "self.batched and len(x) == B", "self.batched"),
         ("SampleReader.camera", "Camera(x[:, :2], x[:, 2:], distortion)", "Camera(x[:, ::2], x[:, 1::2], distortion)"),
         ("SampleReader.camera", "Camera(x[:, :2], x[:, 2:], distortion)", "Camera(x[:, :2], x[:, 2:])"),
         ("numbers_fingerprint", ' or value.dtype.kind not in "buif"', ""),

@@ -491,6 +491,9 @@ def test_matrices_of_four_rows(T):
     K4[:3, :3] = matrix(*K)
     for value in (K4, np.stack([K4] * T), torch.from_numpy(K4)):
         assert torch.equal(numbers(read(sample(image=images, intrinsics=value)).reference.camera), torch.tensor([K]))
+    other_last_row = K4 + np.diag([0, 0, 0, 1]).astype(np.float32)
+    if T == 1:
+        assert torch.equal(numbers(read(sample(intrinsics=other_last_row)).reference.camera), torch.tensor([K]))
     if T == 4:
         rows = np.array([[20 + k, 22, 3.6, 2.4] for k in range(4)], np.float32)
         assert torch.equal(
