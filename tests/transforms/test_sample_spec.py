@@ -159,6 +159,8 @@ def test_unsigned_words_of_torch_are_read_too():
 
 
 def test_what_is_no_return_is_zero():
+    numbers_that_are_none = torch.tensor([torch.inf, -torch.inf, torch.nan, 1000.0])
+    assert SampleSpec(depth_unit="mm")._scaled(numbers_that_are_none).tolist() == [0, 0, 0, 1]
     depth = metres()
     depth[0, :4] = np.nan, np.inf, -np.inf, -1
     wanted = depth.copy()
