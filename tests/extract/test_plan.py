@@ -159,12 +159,13 @@ def test_a_method_is_given_what_the_frames_know():
 
 
 def test_what_readers_give_is_trusted():
-    """Metres and intrinsics are the readers' own: no depth is too far, no principal point too far off."""
+    """Metres and intrinsics are the readers' own: no depth is too far, no principal point too far off, no field too wide."""
     far = Frame(
         frame(1).image, 5000 + frame(1).depth, Camera(torch.tensor([[30.0, 30]]), torch.tensor([[400.0, -300]]))
     )
     near = far.replace(depth=far.depth * 1e-8)
-    for odd in (far, near):
+    wide = far.replace(camera=far.camera.replace(f=torch.full((1, 2), 0.02)))
+    for odd in (far, near, wide):
         assert rows([recording(load=lambda i, odd=odd: odd)], 0)[0].features is not None
 
 
