@@ -1,6 +1,7 @@
 """Geometry images and point clouds of an enriched LeRobot set: the functions of its own maps, byte for byte."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from dhtorch.cli.run import main
 from dhtorch.codes import Cause, Source, names
 from dhtorch.data.codecs.video import read_video_frame, read_video_header, read_video_times
 from dhtorch.export.video import open_lossless_video
-from dhtorch.extract.policy_columns import N_POINTS, make_modality
+from dhtorch.extract.policy_columns import N_POINTS, PolicyColumnWriter, make_modality
 from dhtorch.synthetic.recording import SyntheticRoom
 
 HW, LENGTHS, FPS = (48, 64), (3, 2), 30
@@ -182,11 +183,19 @@ def test_a_groot_file_that_is_no_object_is_refused(tmp_path):
         make_modality(tmp_path, {}, {"front": PICTURE})
 
 
+def test_pictures_are_written_at_the_times_of_their_rows():
+    written = []
+    view = SimpleNamespace(hw=(2, 3), map_hw=(1, 1), lens=())
+    writer = PolicyColumnWriter({"geometry_image": PICTURE}, view, lambda *call: written.append(call))
+    assert writer.add([None, None], [0.5, 0.75]) == {}
+    assert [time for _, time in written] == [0.5, 0.75] and all(p.shape == (2, 3, 3) for p, _ in written)
+
+
 def test_a_set_without_a_groot_file_gets_one_of_its_features(tmp_path):
-    numbers = {"dtype": "float32", "shape": [8]}
-    features = {"observation.state": numbers, "action": numbers, CAMERA: {"dtype": "video", "shape": [*HW, 3]}}
+    numbers, fewer = ({"dtype": "float32", "shape": [n]} for n in (8, 7))
+    features = {"observation.state": numbers, "action": fewer, CAMERA: {"dtype": "video", "shape": [*HW, 3]}}
     modality = make_modality(None, features, {"front_geometry_image": PICTURE})
-    assert modality["state"] == {"state": {"start": 0, "end": 8}} and modality["action"]["action"]["end"] == 8
+    assert modality["state"] == {"state": {"start": 0, "end": 8}} and modality["action"]["action"]["end"] == 7
     assert modality["video"] == {
         "front": {"original_key": CAMERA},
         "front_geometry_image": {"original_key": PICTURE},

@@ -20,7 +20,7 @@ from dhtorch.data import FormatError
 from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.extract.dataset import ExtractedRow
 from dhtorch.extract.plan import ShardSpec
-from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, SampleProblem
+from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, SampleError, SampleProblem
 
 N, P = 5, 6
 SHARED = {
@@ -422,6 +422,22 @@ def test_answers_come_in_the_order_of_their_positions():
     answers = list(engines.run_local(Counted(), order, 0))
     assert [a.place["at"] for a in answers] == order and {a.place["threads"] for a in answers} == {1}
     assert all(type(a) is ExtractedRow and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
+
+
+def test_unreadable_frames_stop_are_left_out_or_blank():
+    wanted = columns.feature_columns(N, P)
+    answers = [
+        ExtractedRow({"frame_index": 0}, None, "frame 0 is damaged"),
+        ExtractedRow({"frame_index": 1}, {"problem": 0}),
+    ]
+    rows = SimpleNamespace(wanted=wanted)
+    with pytest.raises(SampleError, match=r"frame 0 is damaged \(set extract.on_error=skip or flag to continue"):
+        list(engines.filter_rows(answers, "raise", rows, []))
+    complaints = []
+    assert list(engines.filter_rows(answers, "skip", rows, complaints)) == [{"frame_index": 1, "problem": 0}]
+    assert complaints == ["frame 0 is damaged"]
+    blank, whole = engines.filter_rows(answers, "flag", rows, [])
+    assert blank["frame_index"] == 0 and blank["problem"] == SampleProblem.UNREADABLE and whole["frame_index"] == 1
 
 
 def test_arrays_of_an_answer_come_as_they_are():
