@@ -146,6 +146,31 @@ def test_windows_are_fitted_to_walls_that_recede_and_to_other_light(slope, light
     assert torch.allclose(fit.motion[inner].norm(dim=-1), torch.tensor(22.0), rtol=0.3)  # f · |t|, about
 
 
+def test_the_contrast_of_a_window_is_in_the_grey_values_of_view_0():
+    base, view, truth = wall(2.0, (0.2, 0.02, 0.03))
+    alike, darker = (
+        plane_sweep.fit_windows(base, view, plane_sweep.stack_gradients(gain * view.image), truth).contrast
+        for gain in (1.0, 0.7)
+    )
+    inner = slice(None), slice(16, -16), slice(24, -24)
+    assert float((darker / alike)[inner].median()) == pytest.approx(1.0, abs=0.05), "not 0.49"
+
+
+def test_a_point_behind_view_1_is_far_outside_its_picture():
+    a, b, c = torch.tensor([[[2.0] * 3, [3.0] * 3]]), torch.tensor([[[1.0], [-1.0]]]), torch.tensor([[-2.0]])
+    u, v = plane_sweep.EpipolarWarp(a, b, c).at(torch.tensor([[0.0, 0.25, 1.0]]))  # 1 + q c = 1, 0.5, -1
+    assert u.tolist() == [[2.0, 4.5, 3e9]] and v.tolist() == [[3.0, 5.5, 2e9]]
+
+
+def test_a_rolling_shutter_turns_points_by_the_rate_times_their_row():
+    ray, q, rate = torch.tensor([[[0.5, 0.25, 1.0]]]), torch.zeros(1, 1), torch.tensor([[0.1, 0.2, 0.4]])
+    xyz, in_front = plane_sweep._transform_points(ray, q, torch.eye(3)[None], torch.zeros(1, 3), rate)
+    turn = 0.25 * rate[0]  # p, o, s of that row
+    by_hand = ray[0, 0] + torch.linalg.cross(turn, ray[0, 0])
+    torch.testing.assert_close(torch.cat(xyz)[:, 0], by_hand)
+    assert in_front.all()
+
+
 def test_what_the_step_says_of_the_pictures_is_the_derivative_of_the_depth_that_fits():
     """A shift of view 1 along the epipolar line moves the depth by as much as the gradient claims."""
     base, view, truth = wall(2.0, (0.2, 0.0, 0.0), dtype=torch.float64)
@@ -207,6 +232,12 @@ def test_rivals_are_the_best_places_further_away():
     assert bool((plane_sweep.second_best_margin(some, best, torch.tensor([20.0, 20.0])) > 30_000).all()), (
         "all in reach: there is none"
     )
+
+
+def test_bands_of_rows_cover_a_map_once(monkeypatch):
+    monkeypatch.setattr(neighbours, "MAX_BAND_PIXELS", 40)
+    assert neighbours.row_bands(torch.zeros(2, 1, 1, 1), (7, 5)) == [slice(0, 4), slice(4, 7)]
+    assert neighbours.row_bands(torch.zeros(2, 1, 1, 1, requires_grad=True), (7, 5)) == [slice(0, 7)]
 
 
 def test_windows_are_summed_and_their_spread_is_known():
