@@ -280,3 +280,9 @@ def test_the_best_hypothesis_is_the_plane_of_most_support():
     wanted = torch.arange(7)[None] < 5
     inlier = planes._best_hypothesis(support, wanted, DEFAULT_DENSE_OPTIONS)
     assert torch.equal(inlier, on_plane & wanted[:, None])
+
+
+def test_a_residual_is_weighted_plane_less_weighted_inverse_depth():
+    plane = [torch.full((1, 1), value) for value in (2.0, 3.0, 5.0)]
+    terms = tuple(torch.tensor([values])[..., None] for values in ([1.0, 0.5], [10.0, 5.0], [1.0, 0.5], [7.0, 3.5]))
+    assert planes._residual(plane, terms).flatten().tolist() == [2 + 30 + 5 - 7, 15.0]
