@@ -73,7 +73,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_fattened", "options.fattened_ratio * near * n_far", "options.fattened_ratio * near * n_near"),
         ("_torn", "torn & one & alike", "torn & one"),
         ("_torn", "sigma.square() + other_sigma.square()", "other_sigma.square()"),
-        ("_same_surface", "answered[:, 1:] & answered[:, :-1]", "answered[:, 1:]"),
+        (
+            "_same_surface",
+            "answered[:, 1:] & answered[:, :-1]",
+            "answered[:, 1:]",
+            "a pixel without an answer has inverse depth and sigma 0, from which every answer differs",
+        ),
         ("_unsupported", "speck & known.swept", "speck"),
         ("_fill", "| _in_gap(answered)", ""),
         ("_fill", "refuted &= narrowest", "refuted |= narrowest"),

@@ -5,6 +5,8 @@ import torch
 
 from dhtorch.codes import Gate, Source
 from dhtorch.metrics import map_quality
+from dhtorch.pipeline import map_filters
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
 from dhtorch.records import DepthMap
 
@@ -83,6 +85,42 @@ def test_a_halo_beside_returns_is_silent_and_a_surface_that_goes_on_is_not():
     assert (found.gate[0, 14:20, 30:50] == Gate.UNCERTAIN).all() and found.depth[0, 14:20, 30:50].isnan().all()
     assert not changed(planted, found)[16:44, 60:].any()
     assert changed(planted, planted.filtered(torch.tensor([True])))[14:20, 30:50].sum() == 0, "no evidence if sparse"
+
+
+def test_a_strip_as_wide_as_windows_make_it_is_a_halo_and_a_wider_surface_is_none():
+    r, q = DEFAULT_DENSE_OPTIONS.halo_radius_px, torch.full((1, 30, 60), 1 / 1.5)
+    usable = (torch.arange(60) < 20).expand(1, 30, 60)
+
+    def halo(width):
+        """Columns (60,) silent beside returns of the first twenty, of a swept strip, nothing farther."""
+        swept = ~usable & (torch.arange(60) < 20 + width)
+        known = map_filters._Known(torch.where(usable | swept, q, 0.0), 0 * q, usable, swept)
+        return map_filters._halo(known, usable, DEFAULT_DENSE_OPTIONS)[0, 15].nonzero()[:, 0].tolist()
+
+    assert halo(3) == [20, 21, 22] and halo(2 * r) == []
+
+
+def test_a_neighbour_at_a_depth_is_neither_nearer_nor_farther():
+    which = torch.zeros(1, 5, 5, dtype=torch.bool)
+    which[0, 2, 2] = True
+    of = torch.zeros(1, 5, 5)
+    for other, expected in ((2.0, False), (1.05, True), (0.96, True), (0.5, False)):
+        of[0, 0, 4] = other
+        assert map_filters._has_neighbour(torch.ones(1, 5, 5), which, of, 2, 1.1)[0, 2, 2] == expected, other
+
+
+def test_a_speck_of_returns_is_kept():
+    planted = Planted()
+    planted.answered[:] = False
+    planted.plant(slice(5, 8), slice(5, 8), 1.0, returned=True)
+    assert not changed(planted, planted.filtered()).any()
+
+
+def test_a_hole_too_wide_to_be_filled_gets_no_island():
+    side = 2 * DEFAULT_DENSE_OPTIONS.hole_radius_px - 2  # only the four pixels in the middle have a rim on all sides
+    planted = Planted()
+    planted.answered[0, 20 : 20 + side, 20 : 20 + side] = False
+    assert not changed(planted, planted.filtered()).any()
 
 
 def test_a_halo_stays_where_the_sensor_does_not_reach():
