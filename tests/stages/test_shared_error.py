@@ -115,6 +115,7 @@ def test_the_error_of_direction_is_a_share_of_the_turn():
     depth = given[3].depth
     assert torch.allclose(verified.sigma, (given[3].sigma ** 2 + (added * depth) ** 2).sqrt())
     assert torch.allclose(verified.sigma_shared, (given[3].sigma_shared ** 2 + (added * depth) ** 2).sqrt())
+    assert torch.allclose(verified.parts.lens, given[3].kept_parts.lens + (added * depth) ** 2)
     still = verify_views(*views(turn=0.0, parallax=parallax), **OFF | {"turn_share": share})
     assert torch.allclose(still.sigma, given[3].sigma, rtol=(share * MIN_TURN / parallax / 0.04) ** 2 + 1e-12)
 
