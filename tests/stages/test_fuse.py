@@ -9,9 +9,11 @@ from support.view_estimates import make_estimates, random_estimates
 
 from dhtorch.codes import Gate
 from dhtorch.geometry import camera as cam
+from dhtorch.geometry.camera import Camera
+from dhtorch.pipeline import view_selection
 from dhtorch.pipeline.view_selection import downscale_frame, rank_views, select_views_by_preview
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Frame, Samples, Tracks
+from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.stages.fuse import fuse_consistent
 from dhtorch.stages.score import confidence_from_sigma
 from dhtorch.synthetic import open_room
@@ -262,3 +264,24 @@ def test_key_views_takes_what_adds_most():
     views = random_estimates(V=3, B=1, N=4, unanswered=0.0)
     sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[1]]
+
+
+def test_the_information_of_a_view_grows_with_the_turn_of_the_line_and_falls_where_it_is_not_recognised():
+    camera = Camera(torch.tensor([[100.0, 110.0]]), torch.tensor([[50.0, 40.0]]))
+    frame = Frame(torch.zeros(1, 1, 80, 100), torch.zeros(1, 80, 100), camera)
+    motion = Pose(torch.eye(3)[None], torch.tensor([[-0.4, 0.0, -1.0]]))
+    points = torch.tensor([[[0.5, 0.0, 2.0], [0.0, 0.0, 2.0], [0.2, 0.0, 0.5]]])  # the last one comes to lie behind
+    found = view_selection._information(points, frame, motion, 0.1)[0]
+    turn = torch.tensor([math.atan(0.25) - math.atan(0.1), math.atan(0.4)])
+    precision = 0.1 * turn * 100 / view_selection.PREVIEW_TRACK_NOISE_PX
+    seen = (-0.5 * (turn / view_selection.RECOGNISED_TURN_RAD) ** 2).exp()
+    assert found.tolist() == pytest.approx([*((precision * seen) ** 2).tolist(), 0.0], rel=1e-3)
+    aside = motion.replace(t=torch.tensor([[-1.01, 0.0, -0.15]]))  # behind by a turn of little more than a right angle
+    assert view_selection._information(torch.tensor([[[1.0, 0.0, 0.1]]]), frame, aside, 0.1).tolist() == [[0.0]]
+
+
+def test_tracked_motion_is_that_of_valid_tracks_in_tenths_of_the_side():
+    uv_0, none = torch.zeros(1, 2, 2), torch.zeros(1, 2)
+    uv_1, valid = torch.tensor([[[3.0, 4.0], [30.0, 40.0]]]), torch.tensor([[True, False]])
+    tracks = Tracks(uv_0, uv_1, none, none, torch.zeros(1, 2, 2, 2), valid)
+    assert view_selection.tracked_motion(tracks, 50).tolist() == pytest.approx([math.log(2)])
