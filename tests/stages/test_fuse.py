@@ -285,3 +285,10 @@ def test_tracked_motion_is_that_of_valid_tracks_in_tenths_of_the_side():
     uv_1, valid = torch.tensor([[[3.0, 4.0], [30.0, 40.0]]]), torch.tensor([[True, False]])
     tracks = Tracks(uv_0, uv_1, none, none, torch.zeros(1, 2, 2, 2), valid)
     assert view_selection.tracked_motion(tracks, 50).tolist() == pytest.approx([math.log(2)])
+
+
+def test_views_are_selected_by_what_they_add_and_the_later_of_equals():
+    information = torch.tensor([[0.0, 20.0], [1.0, 4.0], [1.0, 4.0]])[:, None]
+    selection = view_selection._select_greedily(information, 2)
+    assert selection.index.tolist() == [[0], [2]]
+    assert selection.gain.flatten().tolist() == pytest.approx([math.log(21), math.log(2) + math.log(25 / 21)])
