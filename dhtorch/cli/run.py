@@ -662,6 +662,8 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
 
     try:
         return {name: instantiate(cfg[name], _convert_="all") for name in names}
+    except TypeError as error:  # of a flag like _partial_; those of a constructor are an InstantiationException
+        raise ValueError(" ".join(str(error).split())) from error
     except Exception as error:
         cause = errors.unwrap_cause(error)
         root = cfg.data.get("root")

@@ -178,7 +178,7 @@ def _pair_by_place(n: int, m: int) -> list[FilmPairing]:
 
 def _starts(n: int, m: int) -> range:
     """Rows (or, negative, pictures) at which a film may start."""
-    rows, pictures = (min(max(d, 0) + _MORE_STARTS, _MAX_STARTS) for d in (n - m, m - n))
+    rows, pictures = (min(max(d, 0) + _MORE_STARTS, _MAX_STARTS, k - 1) for d, k in ((n - m, n), (m - n, m)))
     return range(-pictures, rows + 1)
 
 

@@ -301,7 +301,7 @@ class LearnedScore(nn.Module):
             scorer = cls(len(weights["last"]), half_error=half_error, min_score=min_score)
             scorer.load_state_dict(weights)
             scorer.provenance = dict(content["provenance"])
-        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
             reason = " ".join(str(error).split())
             raise ValueError(
                 f"{where}: found {reason}, expected a learned score on {', '.join(SCORE_FEATURES)}"

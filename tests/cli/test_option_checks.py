@@ -240,7 +240,20 @@ def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, 
 
 
 @pytest.mark.parametrize(
-    "content", ["n: [1, 2", "a: b: c", "\tn: 1", "n: 1\n  m: 2", "&a [*b]", "- 1\n- 2", "3", "", "%", "\x00"]
+    "content",
+    [
+        "_target_: dhtorch.pipeline.method.Method\n_partial_: x",
+        "n: [1, 2",
+        "a: b: c",
+        "\tn: 1",
+        "n: 1\n  m: 2",
+        "&a [*b]",
+        "- 1\n- 2",
+        "3",
+        "",
+        "%",
+        "\x00",
+    ],
 )
 @pytest.mark.parametrize("command", ["complete", "run"])
 def test_settings_of_a_user_that_are_no_settings_are_one_line(tmp_path, monkeypatch, capsys, content, command):

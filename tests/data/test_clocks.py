@@ -41,6 +41,12 @@ def test_a_short_film_of_constant_rate_may_start_at_any_row() -> None:
     assert len(paired(ROWS[:6])) == 7  # a nominal rate and the first half, or the whole at half the rate: not known
 
 
+def test_a_few_pictures_or_rows_start_within_both() -> None:
+    for n, m in ((4, 3), (3, 4), (2, 12), (12, 2)):
+        for candidate in paired(ROWS[:m] * 1.3, ROWS[:n]):
+            assert len(candidate) == n and max(candidate) < m
+
+
 def test_a_gap_and_a_lost_end_fit_twice() -> None:
     assert len(paired(np.delete(ROWS, [4, 5, 11]))) == 2
 

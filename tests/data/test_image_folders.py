@@ -283,6 +283,9 @@ def test_extrinsics_that_are_not_applied_are_named(tmp_path: Path) -> None:
     (tmp_path / "intrinsic" / "extrinsic_color.txt").write_text(parts.format_rows(matrix))
     (line,) = data.open(tmp_path).report
     assert line.startswith("extrinsic_color.txt is not the identity; not applied")
+    (tmp_path / "intrinsic" / "extrinsic_color.txt").write_text(parts.format_rows(matrix[:3]))
+    with pytest.raises(FormatError, match=r"extrinsic_color\.txt: .*3 rows.*4 rows"):
+        data.open(tmp_path)
 
 
 def test_sens_folder_of_png_depth_in_another_unit(tmp_path: Path) -> None:

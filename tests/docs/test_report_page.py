@@ -295,6 +295,11 @@ def test_real_holes_beyond_the_cutoff_have_a_table_of_their_own():
     assert main.flat_head()[2] == "truth kept" and main.rows[0][3] == "0 %", "the sensor alone answers nothing"
 
 
+def test_a_cell_of_another_type_is_refused_and_names_its_column():
+    with pytest.raises(ValueError, match=r"median_rel: found \{'a': 1\}, expected a number"):
+        cells.format_value({"a": 1}, "median_rel")
+
+
 def test_negative_results_stand_beside_the_papers_figure():
     """Ours from the committed files, not copied here: the cell beside the paper's is the summary's number."""
 

@@ -412,6 +412,7 @@ def test_it_travels_as_text_and_as_weights_only(tmp_path):
         lambda c: c["weights"].update(extra=[0.0]),
         lambda c: c["weights"]["last"].__setitem__(0, "1"),
         lambda c: c["weights"]["last"].__setitem__(0, float("nan")),
+        lambda c: c["weights"]["last"].__setitem__(0, 10**400),
         lambda c: c.update(half_error=None),
     ],
 )

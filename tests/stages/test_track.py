@@ -14,6 +14,7 @@ from support.textures import levels
 
 from dhtorch.geometry.lucas_kanade import CELL_LEVEL
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
+from dhtorch.ops import dispatch
 from dhtorch.records import TrackHint
 from dhtorch.stages.track import lucas_kanade, refine_tracks
 
@@ -252,9 +253,9 @@ def test_a_point_does_not_depend_on_its_company(normalise):
     assert not padded.valid[:, 150:].any()
 
 
-def test_points_that_share_a_coarse_search_do_not_depend_on_each_other():
-    """On four levels points of one cell are searched for together: bit for bit as alone, and as where nothing is shared
-    (under vmap)."""
+def test_points_that_share_a_coarse_search_do_not_depend_on_each_other(monkeypatch):
+    """On four levels points of one cell are searched for together: bit for bit as alone, and in torch as where nothing is
+    shared (under vmap)."""
     H, W = 176, 200
     src, dst = (scene(2, H, W, shift, dtype=torch.float32) for shift in ((0.0, 0.0), (11.3, -6.2)))
     uv = points(2, 100, H, W, dtype=torch.float32)
@@ -266,6 +267,8 @@ def test_points_that_share_a_coarse_search_do_not_depend_on_each_other():
         assert all(torch.equal(getattr(alone, f)[0, 0], getattr(whole, f)[b, n]) for f in FIELDS)
     part = uv[:, :20]
     mapped = torch.func.vmap(lambda i, j, x: lucas_kanade(i[None], j[None], x[None])[0])(src, dst, part)
+    monkeypatch.setattr(dispatch, "is_in_use", lambda: False)
+    whole = lucas_kanade(src, dst, uv)
     assert all(torch.equal(getattr(mapped, f), getattr(whole, f)[:, :20]) for f in FIELDS)
 
 

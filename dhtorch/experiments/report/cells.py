@@ -141,6 +141,8 @@ def format_value(value: Any, metric: str = "", how: str | None = None) -> str:
         return value
     if isinstance(value, list):
         return "×".join(format_value(v, how="plain") for v in value)
+    if not isinstance(value, int | float):
+        raise ValueError(f"cell {metric or how}: found {value!r}, expected a number, a word or a list of them")
     how = how or metric_style(metric)
     whole = isinstance(value, int) and how == "plain"
     return (str(value) if whole else _format_number(float(value), how)).replace("-", "−")

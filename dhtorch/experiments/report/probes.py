@@ -67,7 +67,7 @@ def visual_odometry_tables(result: Result) -> list[ReportTable]:
             [
                 row["scene"],
                 arm,
-                format_value(row["n_samples"], how="count"),
+                format_value(row.get("n_samples"), how="count"),
                 *numbers,
                 _format_interval(_ratio_interval(row)),
             ]
@@ -95,7 +95,7 @@ def downstream_tables(result: Result) -> list[ReportTable]:
     rows = []
     for row in scene_rows(result):
         cells = [row["scene"].removesuffix(" held out"), _label(result, row["method"])]
-        cells += [format_value(row["n_samples"], how="count"), _format_number(row.get("mse"))]
+        cells += [format_value(row.get("n_samples"), how="count"), _format_number(row.get("mse"))]
         for name in ("vs_context", "vs_sensor"):
             interval = {"low": row.get(f"{name}_low"), "high": row.get(f"{name}_high")}
             cells += [_format_number(row.get(name)), _format_interval(interval)]
