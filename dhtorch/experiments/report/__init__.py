@@ -132,14 +132,22 @@ def main(argv: Sequence[str]) -> int:
     if len(options.result) == 1 and len(results) > 1 and len(experiments) == 1 and get_verbosity() != "verbose":
         return 0  # the table of the sweep is enough; -v shows every job
     for path, result in zip(paths, results, strict=True):
-        if options.markdown:
-            print(to_markdown(result))
-            continue
-        print(path)
-        print_tables(result)
-        if result["verdict"]:
-            print(f"{result['question']}\n{result['verdict']}: {result['why']}\n")
+        try:
+            _print_result(path, result, markdown=options.markdown)
+        except ValueError as error:  # of a cell
+            raise ValueError(f"{path}: {error}") from error
     return 0
+
+
+def _print_result(path: Path, result: Result, *, markdown: bool) -> None:
+    """Print one archived result: its tables, and the verdict on its question."""
+    if markdown:
+        print(to_markdown(result))
+        return
+    print(path)
+    print_tables(result)
+    if result["verdict"]:
+        print(f"{result['question']}\n{result['verdict']}: {result['why']}\n")
 
 
 def _find_results(paths: Iterable[Path]) -> Iterable[Path]:
