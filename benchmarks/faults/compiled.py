@@ -86,7 +86,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("add_up", "square < square_limit", "square < 4 * square_limit"),
         ("add_up", "-b * w * f[1]", "-a * w * f[1]"),
         ("whitened_length", "total += x * x;", "total += x;"),
-        ("pose_last_step", "enough ? in : use", "use"),
+        (
+            "pose_last_step",
+            "? POSECODE_DEGENERATE\n                        : !enough",
+            "? POSECODE_TOO_FEW\n                        : !enough",
+        ),
         ("pose_last_step", "0.5 * noise * noise", "0.5 * noise"),
         ("solve_spd", "data<double>(b) + n * columns * k", "data<double>(b)"),
     ],

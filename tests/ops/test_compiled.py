@@ -992,6 +992,12 @@ def poses_alike(found, expected):
     turn, shift = (getattr(found.T_1_from_0, k) - getattr(expected.T_1_from_0, k) for k in ("R", "t"))
     apart = torch.cat((turn.abs().flatten(1) / sigma[:, :3].amax(1, keepdim=True), shift.abs() / sigma[:, 3:]), 1)
     assert apart[expected.ok].quantile(0.99) <= 0.01
+    for name in ("rms_px", "sigma_px", "t_snr", "cov"):
+        a, b = (
+            getattr(fit, name)[expected.ok].flatten(1) if name == "cov" else getattr(fit, name)[expected.ok]
+            for fit in (found, expected)
+        )
+        assert ((a - b).abs() <= 1e-3 * b.abs() + 1e-9).float().mean() >= 0.99, name
     return int(expected.ok.sum())  # poses
 
 
