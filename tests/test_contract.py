@@ -670,7 +670,10 @@ ELSEWHERE = {
     "dhtorch.pipeline.dense.top_views",
     *(f"dhtorch.pipeline.completion.{name}" for name in ("complete_depth", "default_calibration")),
     "dhtorch.pipeline.fused.fuse_with_sweep",
-    "dhtorch.pipeline.map_filters.filter_map",
+    *(
+        f"dhtorch.pipeline.map_filters.{name}"
+        for name in ("filter_map", "map_fields", "with_fields", "copy_fields", "fill_fields")
+    ),
     "dhtorch.pipeline.planes.fill_planes",
     "dhtorch.pipeline.dense.source_view_of",
     *(f"dhtorch.pipeline.surface.{name}" for name in ("sweep_planes", "refine_surface", "pose_variance")),

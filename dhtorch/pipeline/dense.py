@@ -33,7 +33,14 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
-from dhtorch.pipeline.map_filters import SensorReturns, filter_map
+from dhtorch.pipeline.map_filters import (
+    FIELD_DTYPES,
+    SensorReturns,
+    copy_fields,
+    filter_map,
+    map_fields,
+    with_fields,
+)
 from dhtorch.pipeline.planes import fill_planes
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples, SigmaBudget
@@ -344,8 +351,7 @@ def _gate(*tensors: Any, options: DenseOptions) -> tuple[Tensor, ...]:
     swept = _gated(known, surface.RefinedSurface(*tensors[:5]), (beyond, alone), pair_gate, options)
     swept = _check_against_returns(swept, returns, scale_error, options)
     assert swept.parts is not None
-    parts = swept.parts.track, swept.parts.pose, swept.parts.reference
-    return (swept.depth, swept.sigma, swept.score, swept.source, swept.gate, *parts)
+    return (*map_fields(swept), swept.parts.track, swept.parts.pose, swept.parts.reference)
 
 
 def _gated(
@@ -421,23 +427,18 @@ def _check_against_returns(
 
 def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
     """The sensor's returns where they are usable, else the swept map where it is answered."""
-    columns = swept.depth, swept.sigma, swept.score, swept.source, swept.gate
     sensed = (x.to(swept.depth) for x in (returns.depth, returns.sigma, returns.confidence))
-    depth, sigma, score, source, gate = _merge(*columns, *sensed, returns.usable)
-    return DepthMap(depth, sigma, score, source, gate, swept.parts)
+    return with_fields(swept, _merge(*map_fields(swept), *sensed, returns.usable))
 
 
 def _merge_kernel(*tensors: Tensor) -> tuple[Tensor, ...]:
-    merged = [x.clone(memory_format=torch.contiguous_format) for x in tensors[:5]]
-    torch.ops.dhtorch.merge_maps.default(*merged, *(x.contiguous() for x in tensors[5:]))  # in place
+    merged = copy_fields(tensors)
+    torch.ops.dhtorch.merge_maps.default(*merged, *(x.contiguous() for x in tensors[len(merged) :]))  # in place
     return tuple(merged)
 
 
 _MERGE_DTYPES = (
-    dict.fromkeys(("depth", "sigma", "score"), torch.float32)
-    | dict.fromkeys(("source", "gate"), torch.int32)
-    | dict.fromkeys(("near_depth", "near_sigma", "confidence"), torch.float32)
-    | {"usable": torch.bool}
+    FIELD_DTYPES | dict.fromkeys(("near_depth", "near_sigma", "confidence"), torch.float32) | {"usable": torch.bool}
 )
 
 

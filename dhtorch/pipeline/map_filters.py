@@ -13,7 +13,7 @@ second pixel, in both directions, and only around the pixels in question.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -41,6 +41,12 @@ _MIN_DETERMINANT = 0.5
 
 #: Least inverse depth that a filled pixel divides by, 1/m. Source: derived, as that of the swept ones.
 _MIN_INVERSE_DEPTH = 1e-9
+
+
+#: Fields of a map that gates, filters and fills change, with their dtypes. Source: derived, all but the parts of sigma.
+FIELD_DTYPES = dict.fromkeys(("depth", "sigma", "score"), torch.float32) | dict.fromkeys(
+    ("source", "gate"), torch.int32
+)
 
 
 class SensorReturns(NamedTuple):
@@ -72,6 +78,33 @@ class _Known(NamedTuple):
         )
 
 
+def map_fields(of: DepthMap) -> tuple[Tensor, ...]:
+    """The fields :data:`FIELD_DTYPES` of a map."""
+    return tuple(getattr(of, name) for name in FIELD_DTYPES)
+
+
+def with_fields(of: DepthMap, fields: Sequence[Tensor]) -> DepthMap:
+    """The map with other fields :data:`FIELD_DTYPES`; its other fields stay."""
+    return of.replace(**dict(zip(FIELD_DTYPES, fields, strict=True)))
+
+
+def copy_fields(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Contiguous copies of the first tensors, the fields of a map, for kernels that work in place."""
+    return [x.clone(memory_format=torch.contiguous_format) for x in tensors[: len(FIELD_DTYPES)]]
+
+
+def fill_fields(of: DepthMap, where: Tensor, depth: Tensor, sigma: Tensor, relative: Tensor) -> tuple[Tensor, ...]:
+    """The fields of a map answered (FILLED) ``where`` (B, h, w) bool with depth and sigma (B, h, w) m; ``relative``
+    (B, h, w) is sigma / depth."""
+    return (
+        torch.where(where, depth, of.depth),
+        torch.where(where, sigma, of.sigma),
+        torch.where(where, 0.1 / (0.1 + relative), of.score),
+        of.source.masked_fill(where, Source.FILLED),
+        of.gate.masked_fill(where, Gate.ANSWER),
+    )
+
+
 def filter_map(
     swept: DepthMap,
     returns: SensorReturns,
@@ -95,10 +128,8 @@ def filter_map(
     reach = _reach(returns, options)[:, None, None]
     within = returns.usable & (returns.depth.detach() < options.halo_reach * reach)
     within = within if sparse is None else within & ~sparse[:, None, None]
-    columns = swept.depth, swept.sigma, swept.score, swept.source, swept.gate
     sensed = returns.depth, returns.sigma, returns.usable, within
-    depth, sigma, score, source, gate = _filter(*columns, *sensed, grey.detach(), options=options)
-    return swept.replace(depth=depth, sigma=sigma, score=score, source=source, gate=gate)
+    return with_fields(swept, _filter(*map_fields(swept), *sensed, grey.detach(), options=options))
 
 
 #: Fields of :class:`DenseOptions` that the kernel reads, in its order. Source: derived, its declaration.
@@ -110,16 +141,15 @@ _KERNEL_OPTIONS = (
 
 
 def _filter_kernel(*maps: Tensor, options: DenseOptions) -> tuple[Tensor, ...]:
-    filtered = [x.clone(memory_format=torch.contiguous_format) for x in maps[:5]]
-    others = [x.contiguous() for x in maps[5:]]
+    filtered = copy_fields(maps)
+    others = [x.contiguous() for x in maps[len(filtered) :]]
     limits = [getattr(options, name) for name in _KERNEL_OPTIONS]
     torch.ops.dhtorch.filter_map.default(*filtered, *others, *limits, _MIN_DETERMINANT, _MIN_INVERSE_DEPTH)  # in place
     return tuple(filtered)
 
 
 _FILTER_DTYPES = (
-    dict.fromkeys(("depth", "sigma", "score"), torch.float32)
-    | dict.fromkeys(("source", "gate"), torch.int32)
+    FIELD_DTYPES
     | dict.fromkeys(("near_depth", "near_sigma"), torch.float32)
     | dict.fromkeys(("usable", "within"), torch.bool)
     | {"grey": torch.float32}
@@ -138,13 +168,7 @@ def _filter(*maps: Any, options: DenseOptions) -> tuple[Tensor, ...]:
     swept = _silence(swept, before.swept & ~known.swept)
     where, q, sigma = _fill(known, within, options)
     depth = 1 / q
-    return (
-        torch.where(where, depth, swept.depth),
-        torch.where(where, sigma * depth.square(), swept.sigma),
-        torch.where(where, 0.1 / (0.1 + sigma * depth), swept.score),
-        swept.source.masked_fill(where, Source.FILLED),
-        swept.gate.masked_fill(where, Gate.ANSWER),
-    )
+    return fill_fields(swept, where, depth, sigma * depth.square(), sigma * depth)
 
 
 def _reach(returns: SensorReturns, options: DenseOptions) -> Tensor:

@@ -23,13 +23,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.codes import Gate, Source
 from dhtorch.geometry.checks import any_possible, is_static
 from dhtorch.geometry.linalg import quadratic_form
 from dhtorch.geometry.windows import window_extreme
 from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
-from dhtorch.pipeline.map_filters import SensorReturns
+from dhtorch.pipeline.map_filters import (
+    FIELD_DTYPES,
+    SensorReturns,
+    copy_fields,
+    fill_fields,
+    map_fields,
+    with_fields,
+)
 from dhtorch.records import DepthMap
 
 #: Least inverse depth that is divided by, 1/m: of farther points than any sensor or sweep measures.
@@ -92,16 +98,9 @@ class _Planes(NamedTuple):
         return 1 / self.n.clamp_min(1) + quadratic_form(x - self.x_0, y - self.y_0, *self.inverse)
 
 
-#: Fields of a map that a filled pixel changes. Source: derived, all but what its sigma is made of.
-_MAPS = ("depth", "sigma", "score", "source", "gate")
-
 #: Dtypes that the kernel reads, of the maps before and after the filters, returns, grey image and reach.
 _FILL_DTYPES: dict[str, torch.dtype | tuple[torch.dtype, ...]] = {
-    **{
-        f"{map_}_{name}": torch.int32 if name in ("source", "gate") else torch.float32
-        for map_ in ("swept", "support")
-        for name in _MAPS
-    },
+    **{f"{map_}_{name}": dtype for map_ in ("swept", "support") for name, dtype in FIELD_DTYPES.items()},
     **{f"returns_{name}": torch.float32 for name in ("depth", "sigma", "confidence")},
     "usable": torch.bool,
     "grey": torch.float32,
@@ -149,8 +148,8 @@ def fill_planes(
     """
     dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
     reach = torch.where(dense, options.plane_reach * reach, 0.0).to(swept.depth)
-    maps = (getattr(each, name) for each in (swept, support) for name in _MAPS)
-    return swept.replace(**dict(zip(_MAPS, _filled(*maps, *returns, grey, reach, options=options), strict=True)))
+    maps = *map_fields(swept), *map_fields(support)
+    return with_fields(swept, _filled(*maps, *returns, grey, reach, options=options))
 
 
 @cache
@@ -159,9 +158,9 @@ def _tables(reach_cells: int, ray_support: int) -> list[Tensor]:
     return [torch.tensor(x, dtype=torch.int32) for x in (_steps(reach_cells), _triples(ray_support))]
 
 
-def _fill_kernel(*tensors: Any, options: DenseOptions) -> list[Tensor]:
-    filled = [x.clone(memory_format=torch.contiguous_format) for x in tensors[: len(_MAPS)]]
-    known = (x.contiguous() for x in tensors[len(_MAPS) :])
+def _fill_kernel(*tensors: Any, options: DenseOptions) -> Sequence[Tensor]:
+    filled = copy_fields(tensors)
+    known = (x.contiguous() for x in tensors[len(filled) :])
     depth, sigma, _, _, gate, returned, returned_sigma, _, usable, grey, reach = known
     torch.ops.dhtorch.fill_planes.default(
         *(depth, sigma, gate, returned, returned_sigma, usable, grey, reach),
@@ -174,16 +173,16 @@ def _fill_kernel(*tensors: Any, options: DenseOptions) -> list[Tensor]:
 
 
 @operator(kernel=_fill_kernel, dtypes=_FILL_DTYPES, any_layout=tuple(_FILL_DTYPES))
-def _filled(*tensors: Any, options: DenseOptions) -> list[Tensor]:
+def _filled(*tensors: Any, options: DenseOptions) -> Sequence[Tensor]:
     """:func:`fill_planes` of the tensors of maps, returns, grey image and reach (0 where returns are sparse)."""
-    n = len(_MAPS)
+    n = len(FIELD_DTYPES)
     swept, support = (DepthMap(*fields) for fields in (tensors[:n], tensors[n : 2 * n]))
     returns = SensorReturns(*tensors[2 * n : -2])
     grey, reach = tensors[-2:]
     has_sweep = support.keep.flatten(1).any(1)[:, None, None]
     unanswered = has_sweep & ~swept.keep & ~returns.usable
     if not any_possible(unanswered):
-        return list(tensors[:n])
+        return tensors[:n]
     cells = _cells(*_known(support, returns), grey[:, 0].detach().to(swept.depth), options)
     with torch.no_grad():
         slots = _support_slots(cells, options)
@@ -197,7 +196,8 @@ def _filled(*tensors: Any, options: DenseOptions) -> list[Tensor]:
     within_reach = q * reach[:, None, None] > 1
     plausible = (q > MIN_PLANE_INVERSE_DEPTH) & (relative <= options.max_sigma_rel)
     where = unanswered & accepted & plausible & ~within_reach
-    return _answer(swept, where, 1 / torch.where(where, q, torch.ones_like(q)), relative)
+    depth = 1 / torch.where(where, q, torch.ones_like(q))
+    return fill_fields(swept, where, depth, relative * depth.detach(), relative)
 
 
 def _known(swept: DepthMap, returns: SensorReturns) -> tuple[Tensor, Tensor, Tensor]:
@@ -480,14 +480,3 @@ def _per_pixel(x: Tensor, shape: torch.Size, options: DenseOptions) -> Tensor:
     """Values of cells (B, rows, columns) at their pixels (B, h, w)."""
     side = options.plane_cell_px
     return x.repeat_interleave(side, 1).repeat_interleave(side, 2)[:, : shape[1], : shape[2]]
-
-
-def _answer(swept: DepthMap, where: Tensor, depth: Tensor, relative: Tensor) -> list[Tensor]:
-    """The map with depths (B, h, w) of relative sigma ``relative`` ``where`` (B, h, w) bool: its fields ``_MAPS``."""
-    return [
-        torch.where(where, depth, swept.depth),
-        torch.where(where, relative * depth.detach(), swept.sigma),
-        torch.where(where, 0.1 / (0.1 + relative), swept.score),
-        swept.source.masked_fill(where, Source.FILLED),
-        swept.gate.masked_fill(where, Gate.ANSWER),
-    ]

@@ -170,11 +170,6 @@ def _report_extrinsics(root: Path) -> list[str]:
     report = []
     for name in _EXTRINSICS_FILES:
         file = _find_intrinsics(root, (name,))
-        if file is None:
-            continue
-        matrix = files.read_table(file, 4)
-        if len(matrix) != 4:
-            raise FormatError(file, "transform", f"{len(matrix)} rows", "4 rows of 4 numbers")
-        if not np.allclose(matrix, np.eye(4), atol=1e-6):
+        if file is not None and not np.allclose(image_table.read_pose(file), np.eye(4), atol=1e-6):
             report.append(f"{name} is not the identity; not applied: ScanNet's depth is already aligned to colour")
     return report

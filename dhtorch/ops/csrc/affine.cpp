@@ -63,11 +63,6 @@ struct Patch {
   inline Vector clamped(Vector x, Vector y) const;
 };
 
-inline Vector within(Vector x, float most) {  // clamp to [0, most]; NaN becomes 0
-  x = x > 0.0f ? x : Vector{};
-  return x < most ? x : Vector{} + most;
-}
-
 #if defined(__FMA__) && defined(DHTORCH_SHUFFLES)
 // Four pixels and their right neighbours, pair by pair: assembled in registers, where compilers write lanes to memory.
 inline __m256d four_pairs(const float* pixels, const int32_t* at) {

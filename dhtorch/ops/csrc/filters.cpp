@@ -1,7 +1,7 @@
 // Gates and filters of maps. References: small_components of dhtorch/geometry/components.py, _filter of
 // dhtorch/pipeline/map_filters.py, _gate and _merge of dhtorch/pipeline/dense.py; the same results bit for bit, except for
-// square roots, of which torch does not always give the nearest number. One thread, no gradient. The dispatch checks dtypes and
-// strides, Python the shapes.
+// square roots, of which torch does not always give the nearest number. One thread, no gradient. The dispatch checks
+// dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -83,33 +83,28 @@ template <typename T, typename Pick>
 std::vector<T> window_extreme(const std::vector<T>& x, int64_t h, int64_t w, int64_t radius, Pick pick) {
   const int64_t side = 2 * radius + 1, rows = h + 2 * radius;
   std::vector<T> padded(rows * w), row(w + 2 * radius);
+  const auto widen = [&](T* at, int64_t length, int64_t stride) {
+    for (int64_t width = 1; width < side;) {
+      const int64_t shift = std::min(width, side - width);
+      length -= shift;
+#pragma GCC ivdep
+      for (int64_t i = 0; i < length * stride; ++i) at[i] = pick(at[i], at[i + shift * stride]);
+      width += shift;
+    }
+  };
   for (int64_t y = 0; y < h; ++y) {
     const T* from = x.data() + y * w;
     std::fill_n(row.begin(), radius, from[0]);
     std::copy_n(from, w, row.begin() + radius);
     std::fill_n(row.begin() + radius + w, radius, from[w - 1]);
-    T* at = row.data();
-    for (int64_t width = 1, length = w + 2 * radius; width < side;) {
-      const int64_t shift = std::min(width, side - width);
-      length -= shift;
-#pragma GCC ivdep
-      for (int64_t i = 0; i < length; ++i) at[i] = pick(at[i], at[i + shift]);
-      width += shift;
-    }
-    std::copy_n(at, w, padded.begin() + (y + radius) * w);
+    widen(row.data(), w + 2 * radius, 1);
+    std::copy_n(row.begin(), w, padded.begin() + (y + radius) * w);
   }
   for (int64_t k = 0; k < radius; ++k) {
     std::copy_n(padded.begin() + radius * w, w, padded.begin() + k * w);
     std::copy_n(padded.begin() + (radius + h - 1) * w, w, padded.begin() + (radius + h + k) * w);
   }
-  T* at = padded.data();
-  for (int64_t width = 1, length = rows; width < side;) {
-    const int64_t shift = std::min(width, side - width);
-    length -= shift;
-#pragma GCC ivdep
-    for (int64_t i = 0; i < length * w; ++i) at[i] = pick(at[i], at[i + shift * w]);
-    width += shift;
-  }
+  widen(padded.data(), rows, w);
   padded.resize(h * w);
   return padded;
 }
@@ -144,7 +139,7 @@ struct Map {
     }
   }
 
-  // q where `of` and 0 elsewhere.
+  // q where `of`, `elsewhere` in other places.
   template <typename Flag>
   std::vector<float> only(const Flag* of, float elsewhere = 0.0f) const {
     std::vector<float> out(h * w);
@@ -158,12 +153,12 @@ struct Map {
   template <typename Visit>
   void in_vectors(const Mask& which, Visit visit) const {
     const int64_t wide = w + 2 * limits.halo_radius;
-    int64_t pixels[LANES], count = 0;
-    Bits first = {};
+    int64_t count = 0;
+    Bits pixels = {}, first = {};
     for (int64_t n = 0; n <= h * w; ++n) {
       if (n < h * w) {
         if (!which[n]) continue;
-        pixels[count] = n;
+        pixels[count] = static_cast<int32_t>(n);
         first[count] = static_cast<int32_t>(n / w * wide + n % w);
         if (++count < LANES) continue;
       }
@@ -192,10 +187,8 @@ struct Map {
   Mask has_neighbour(const Mask& which, const std::vector<float>& of) const {
     Mask out(h * w);
     const auto padded = with_margin(of.data(), h, w, limits.halo_radius);
-    in_vectors(which, [&](int64_t count, const int64_t* pixels, Bits first) {
-      Vector own;
-      for (int64_t i = 0; i < LANES; ++i) own[i] = q[pixels[i]];
-      const Vector low = own / limits.step_ratio, high = own * limits.step_ratio;
+    in_vectors(which, [&](int64_t count, Bits pixels, Bits first) {
+      const Vector own = gather(q.data(), pixels), low = own / limits.step_ratio, high = own * limits.step_ratio;
       Bits met = {};
       window([&](int32_t offset) {
         const Vector other = gather(padded.data() + offset, first);
@@ -250,12 +243,9 @@ struct Map {
       edge[n] = swept[n] & (q[n] - farthest[n] > step);
     }
     const auto depths = with_margin(q.data(), h, w, limits.halo_radius), shades = with_margin(grey, h, w, limits.halo_radius);
-    in_vectors(edge, [&](int64_t count, const int64_t* pixels, Bits first) {
-      Vector own, shade, near = {}, far = {}, n_near = {}, n_far = {};
-      for (int64_t i = 0; i < LANES; ++i) {
-        own[i] = q[pixels[i]];
-        shade[i] = grey[pixels[i]];
-      }
+    in_vectors(edge, [&](int64_t count, Bits pixels, Bits first) {
+      const Vector own = gather(q.data(), pixels), shade = gather(grey, pixels);
+      Vector near = {}, far = {}, n_near = {}, n_far = {};
       window([&](int32_t offset) {
         const Vector other = gather(depths.data() + offset, first), scaled = other * limits.step_ratio,
                      differ = (gather(shades.data() + offset, first) - shade) / limits.grey_similarity,

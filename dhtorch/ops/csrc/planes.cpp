@@ -399,7 +399,7 @@ struct Fits {
     return total / std::max(count, 1.0f);
   }
 
-  // Answer the unanswered pixels of cell n, of _at_pixels and _answer in planes.py.
+  // Answer the unanswered pixels of cell n, of _at_pixels in planes.py and fill_fields in map_filters.py.
   void answer(const Maps& maps, int64_t n, float differing) const {
     const Plane& of = plane[n];
     const int64_t row = n / cells.columns, column = n % cells.columns;

@@ -49,13 +49,6 @@ inline Bits set_bits(Bits code) {
 #endif
 }
 
-// Whole part of x within 0 and `most`; 0 where it is no number.
-inline Bits whole_within(Vector x, float most) {
-  x = x > 0.0f ? x : Vector{};
-  x = x < most ? x : Vector{} + most;
-  return __builtin_convertvector(x, Bits);
-}
-
 // Add the census cost of every pixel and plane to C (B, h, w, D) uint8, or write it if C is `fresh`. code_0 (B, N) and
 // code_1 (B, rows * columns) int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: a pixel is seen at
 // (a + q b) / (1 + q c) + margin. `unseen`: cost where view 1 shows nothing.
@@ -85,8 +78,8 @@ void add_census_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b
       const Bits own = Bits{} + here[n];
       for (int64_t i = 0; i < blocks; ++i) {
         const Vector s = load(scale[i].of);
-        const Bits column = whole_within((u0 + load(along[i].of)) * s + inside, right),
-                   row = whole_within((v0 + load(across[i].of)) * s + inside, down);
+        const Bits column = __builtin_convertvector(within((u0 + load(along[i].of)) * s + inside, right), Bits),
+                   row = __builtin_convertvector(within((v0 + load(across[i].of)) * s + inside, down), Bits);
         const Bits code = gather(there, row * static_cast<int32_t>(columns) + column);
         Bytes added = __builtin_convertvector(code < 0 ? none : set_bits(code ^ own), Bytes);
         const int64_t count = std::min(LANES, D - i * LANES);

@@ -96,6 +96,12 @@ inline float over(float x) {
 #endif
 }
 
+// x within 0 and `most`; 0 where it is no number.
+inline Vector within(Vector x, float most) {
+  x = x > 0.0f ? x : Vector{};
+  return x < most ? x : Vector{} + most;
+}
+
 // from[at] of each lane.
 inline Bits gather(const int32_t* from, Bits at) {
 #if defined(__AVX512F__)
