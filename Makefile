@@ -4,7 +4,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles a package where it is imported first: most of what is installed never is.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 # Where torch's builds for the CPU are: on Linux pip's own choice brings CUDA, some gigabytes. `make TORCH_INDEX= run` leaves
 # the choice to pip; so does a machine that cannot reach the place, unless a build lies where pip is told to look.
@@ -74,8 +75,8 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@echo "== installing into $(VENV), with what tests and benchmarks need"
 	$(PYTHON) -m venv $(VENV)
 	@$(TORCH)
-	$(PIP) -e ".[dev]"
-	@$(OPS)
+	$(PIP) -e .
+	@($(OPS)) & ops=$$!; $(PIP) -e ".[dev]"; pip=$$?; wait $$ops; exit $$pip  # compiles beside the downloads
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-all: $(VENV)/.installed-dev

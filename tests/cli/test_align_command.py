@@ -83,6 +83,7 @@ def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     assert "Exceeded" in (tmp_path / "out" / "align.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_told(tmp_path, room, capsys):
     for k in range(2):
         depth = room[k].depth[0].numpy()

@@ -142,6 +142,7 @@ def refuted(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_inspect_shows_unit_agreement_and_findings(refuted):
 
     survey = Survey("walk", "frames_dir")

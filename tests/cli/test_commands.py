@@ -147,6 +147,7 @@ def test_everything_is_shown_on_request(command):
 SMALL_DEMO = ["--max-frames", "1", "--size", "64", "--method.n", "256", "--no-browser"]
 
 
+@pytest.mark.slow
 def test_the_demo_goes_the_whole_way(command, monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "_IMAGE_HW", (96, 128))
     monkeypatch.setattr(demo, "_N_FRAMES", 4)

@@ -158,6 +158,7 @@ def test_experiments_with_loops_of_their_own_keep_their_scenes(command, monkeypa
         assert content(tmp_path / f"{experiment}_cut") == content(tmp_path / experiment)
 
 
+@pytest.mark.slow
 def test_examples_for_figures_are_kept_with_their_method(scenes, tmp_path):
     variants = {"paper": protocol.Variant(METHODS["paper"].replace(n=512))}
 

@@ -212,6 +212,7 @@ def test_sound_recordings_raise_no_warning() -> None:
     assert warned(walk(6)) == []
 
 
+@pytest.mark.slow
 def test_poses_that_are_constant_or_turn_only() -> None:
     frames = walk(4)
     still = Pose(pose(0).R.expand(4, 3, 3), pose(0).t.expand(4, 3))
@@ -252,6 +253,7 @@ def test_times_that_stand_or_gap() -> None:
     assert "no time stamps" in warned(frames, times=None)
 
 
+@pytest.mark.slow
 def test_depth_that_cannot_be() -> None:
     frames = walk(3)
 
@@ -267,6 +269,7 @@ def test_depth_that_cannot_be() -> None:
     assert "1 of 3 depth maps that were read are empty" in warned(one)
 
 
+@pytest.mark.slow
 def test_pictures_and_cameras_that_cannot_be() -> None:
     frames = walk(3)
     assert "all frames that were read are the same picture" in warned(

@@ -153,6 +153,7 @@ def test_the_sweeps_of_hydra_choose_groups(command, monkeypatch, typed, methods)
     assert chosen == methods and f"{len(methods)} jobs" in out
 
 
+@pytest.mark.slow
 def test_deleting_the_holdout_is_no_holdout(command, monkeypatch):
     seen = []
     monkeypatch.setattr(
@@ -171,6 +172,7 @@ def test_names_of_places_are_one_text():
     assert words.quote_words(["seed=0,1", "extract.columns=[a,b]"], True) == ["seed=0,1", "extract.columns=[a,b]"]
 
 
+@pytest.mark.slow
 def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):
     data = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "figures=false"]
     code, out, _ = command("-m", *data, "pairs.gap=1,2", "method.n=256", "output=a=b")
@@ -192,6 +194,7 @@ def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):
     assert {(0, 1), (1, 2)} <= jobs.jobs_table(results).best
 
 
+@pytest.mark.slow
 def test_a_job_says_little_and_all_of_it_when_asked(command):
     code, out, _ = command(*TINY)
     assert code == 0 and len(out.splitlines()) <= 15 and "samples by gate" not in out

@@ -105,6 +105,7 @@ def test_quiet_is_not_silent_about_errors(command):
     assert code == 2 and out == ""
 
 
+@pytest.mark.slow
 def test_verbose_says_what_is_read_and_done(command):
     code, out, err = command(*TINY, "-v")
     lines = err.strip().splitlines()
@@ -228,6 +229,7 @@ def test_exit_codes(command):
         assert command(*words)[0] == 2, words
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
 def test_a_reader_that_leaves_is_no_error(said):
     folder, _ = said
@@ -251,6 +253,7 @@ def stopping(function, after):
     return call
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch):
     monkeypatch.setattr(capture, "write_contact_sheet", stopping(capture.write_contact_sheet, 1))
     code, out, err = command("inspect", str(frames), "--out", "sheets")

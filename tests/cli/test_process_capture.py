@@ -144,6 +144,7 @@ def refusal(words, capsys):
     return said.err
 
 
+@pytest.mark.slow
 def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp_path, capsys):
     room = SyntheticRoom(hw=(48, 64), n_frames=3)
     writers.write_stray(tmp_path / "both" / "alone", list(room), video=False)

@@ -241,6 +241,7 @@ def test_names_of_jobs_can_be_read(monkeypatch):
     assert job_name("data.root=/elsewhere/tum") == job_name("data.root=tum")
 
 
+@pytest.mark.slow
 def test_changed_data_are_another_question(command, tmp_path):
     room = SyntheticRoom(hw=(60, 80), n_frames=3, supersample=1, lidar="exact")
     writers.write_counted_frames(tmp_path / "set", [room[i] for i in range(3)])
@@ -293,6 +294,7 @@ def test_only_our_own_warnings_are_seen(monkeypatch, asked):
     assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pipeline.pair"])
 
 
+@pytest.mark.slow
 def test_the_result_is_strict_json_of_its_own_job(command, tmp_path):
     assert command("-m", "output=sweep", *TINY, "seed=0,1")[0] == 0
     for path in results(tmp_path):

@@ -27,6 +27,7 @@ def model(tmp_path):
     return folder, true
 
 
+@pytest.mark.slow
 def test_a_model_is_written_in_metres(capture, model, capsys):
     folder, true = model
     assert run.main(["scale", str(folder), str(capture), "--cutoff", "2.5"]) == 0
@@ -49,6 +50,7 @@ def test_the_model_is_moved_into_the_world_of_the_capture(capture, model, tmp_pa
     np.testing.assert_allclose(found[:, :3, 3], poses[:, :3, 3], atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_drifting_model_is_refused(capture, tmp_path, capsys):
     content, _ = made.room_model("maps", "drift", 0.08)
     made.write_arrays(tmp_path / "model", content)

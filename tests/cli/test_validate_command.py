@@ -54,6 +54,7 @@ def validated(out, *words, capsys=None):
     return code, json.loads((out / "validate.json").read_text())
 
 
+@pytest.mark.slow
 def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     out = tmp_path / "out"
     code, found = validated(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
@@ -281,6 +282,7 @@ def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
 OPTIONS = {"image": "image", "depth": "depth", "intrinsics": "intrinsics", "depth_unit": "mm", "n": 256}
 
 
+@pytest.mark.slow
 def test_a_loader_gets_verdicts_of_one_shape():
     transform = ValidateDepth(map="map", judging={"size": 64}, **OPTIONS)
     samples = []

@@ -43,7 +43,9 @@ def some(recording: data.Recording, n: int = 6) -> list[tuple[Tensor, Tensor]]:
 
 @pytest.mark.data
 @pytest.mark.skipif(ROOT is None, reason="DHTORCH_DATA is not set")
-@pytest.mark.parametrize("capture", CAPTURES)
+@pytest.mark.parametrize(
+    "capture", [pytest.param(name, marks=[pytest.mark.slow] * (k % 2)) for k, name in enumerate(CAPTURES)]
+)
 def test_the_stored_orientation_of_sound_captures_wins(capture: str) -> None:
     frames = some(data.open(Path(str(ROOT)) / capture))
     scores = torch.stack([orientation.orientation_scores(image, depth) for image, depth in frames])

@@ -187,6 +187,7 @@ def test_recording_is_a_sequence(tmp_path: Path) -> None:
         replace(recording, number=consecutive_frame_numbers(3))
 
 
+@pytest.mark.slow
 def test_recording_travels_to_spawned_workers(tmp_path: Path) -> None:
     writers.write_named_frames(tmp_path, walk())
     recording = pickle.loads(pickle.dumps(data.open(tmp_path)))

@@ -180,6 +180,7 @@ def test_markup_is_escaped_once():
 # ---------------------------------------------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_and_nowhere_else(tmp_path, capsys):
     kept = result_files.write_result(tmp_path / "sweep/a/result.json", results()[0])
     result_files.write_result(tmp_path / "sweep/b/result.json", results()[1])

@@ -84,6 +84,7 @@ def test_a_point_becomes_a_disc_of_its_diameter():
     torch.testing.assert_close(sharp, point[0], atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_lens_covers_what_is_behind_as_an_exact_light_field_does():
     """The mean of pinhole pictures from all over the aperture is the truth, occlusion included."""
 
@@ -162,6 +163,7 @@ def test_bad_input():
         open_viewpoints(0)
 
 
+@pytest.mark.slow
 def test_a_run_and_its_rows():
     views = open_viewpoints(1, hw=(120, 160))
     outcome = experiment.run(views, {}, None, Settings(), axial_colour_dpt=0.5)

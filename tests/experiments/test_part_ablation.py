@@ -126,6 +126,7 @@ def test_a_tracker_that_knows_no_start_is_left_alone(every):
     assert all(v.track is print for v in part_ablation.build_auto_ablations(window, auto).values())
 
 
+@pytest.mark.slow
 def test_one_group_alone_also_where_there_is_one_other_frame():
     """A variant of several views is asked as a pair there, so that the start and the score are counted."""
     asked = []

@@ -78,6 +78,7 @@ def test_set_b_is_hidden_from_the_method_and_measured_by_its_returns():
     assert bool((~naive.ok | trace["fit"].inlier).all()) and not bool((naive.ok & truth.ok).any())
 
 
+@pytest.mark.slow
 def test_heldout_rows_and_strict_line():
     outcome = asked(heldout, small_room(lidar="exact"))
     row = scene(outcome, "paper", "heldout")
@@ -95,6 +96,7 @@ def test_heldout_rows_and_strict_line():
         assert not heldout.passes_strict_line(good | worse)
 
 
+@pytest.mark.slow
 def test_recovered_holes_reach_beyond_the_sensor():
     row = scene(asked(heldout, small_room(range_limit=2.0)), "paper", "heldout")
     assert row["n_recovered"] > 300 and row["reach_p95_m"] > 1.3 * row["returns_max_m"] > 1.3 * 1.5
@@ -128,6 +130,7 @@ def test_range_split_has_one_cohort_for_all_variants():
     assert {f"{v}.coverage" for v in five} | {"gated, cutoff 1.5 m.pnp_success"} <= set(outcome.summary)
 
 
+@pytest.mark.slow
 def test_real_holes_beyond_the_cutoff_are_counted_apart():
     """Independent truth knows depth where the sensor has none: those samples are in a cohort of their own."""
     recording = small_room()
@@ -192,6 +195,7 @@ def test_the_protocols_take_the_truth_test_and_state_what_it_keeps(experiment):
         assert raw["n_candidates"] > full["n_candidates"] > 0, key
 
 
+@pytest.mark.slow
 def test_a_method_that_states_no_sigma_has_no_number_of_it():
     methods = {name: configured_method(name) for name in ("paper", "opencv", "map")}
     outcome = pair.run([room_scene(small_room(), gap=3)], methods, by_gap, Settings())
@@ -264,6 +268,7 @@ def test_raw_trajectory_forgets_the_conversion_and_nothing_else():
     assert not bool(trajectory_pose_fit(none, 5).ok.any())
 
 
+@pytest.mark.slow
 def test_device_pose_measures_the_disagreement():
     outcome = asked(device_pose, small_room(trajectory_offset_deg=15.0, lidar="exact"))
     anchored, given = (scene(outcome, v, "heldout") for v in ("anchored", "device_gl_to_cv"))

@@ -47,6 +47,7 @@ def test_scene_rows_have_the_numbers_and_the_halves_are_gone(outcome):
     assert not any("half" in name for name in outcome.summary)
 
 
+@pytest.mark.slow
 def test_the_verdict_counts_scenes_within_the_tolerance_and_the_largest_bias(outcome):
     assert outcome.summary["auto.scenes_within"]["value"] == 0, "all of the answers are more than 98 %"
     assert outcome.summary["auto.scenes_within"]["n"] == 3

@@ -128,6 +128,7 @@ def test_a_cluster_gives_the_same_bytes(robot, whole, tmp_path):
     assert read_files(enrich(robot, tmp_path / "set", "engine=ray")) == read_files(whole)
 
 
+@pytest.mark.slow
 def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
     source = tmp_path / "source"
     shutil.copytree(robot, source)
@@ -178,6 +179,7 @@ def test_tasks_that_are_noted_for_an_episode_are_kept(version, tmp_path):
     assert {row["task_index"] for row in read_rows(out)} == {0}
 
 
+@pytest.mark.slow
 def test_splits_are_in_the_new_numbers(tmp_path):
     source = tmp_path / "source"
     source.mkdir()
@@ -256,6 +258,7 @@ def test_samples_alone(whole):
         assert 0 < found.sum() <= 64
 
 
+@pytest.mark.slow
 def test_an_older_version_of_the_format(robot, whole, tmp_path):
     one = tmp_path / "older"
     one.mkdir()
@@ -302,6 +305,7 @@ def test_the_whole_is_never_held(tmp_path, monkeypatch):
 # ---------------------------------------------------------------------------------------------------- other sources
 
 
+@pytest.mark.slow
 def test_steps_of_robots_keep_what_they_say(tmp_path):
     """RLDS: numbers, texts, splits, and pictures as they are encoded."""
     source = tmp_path / "1.0.0"
@@ -400,6 +404,7 @@ def test_counts_of_an_episode_are_sums_and_shares_along_it():
     assert (found["frames"], found["unread"]) == (48, 1)
 
 
+@pytest.mark.slow
 def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
     source = tmp_path / "source"
     source.mkdir()

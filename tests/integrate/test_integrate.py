@@ -670,6 +670,7 @@ def test_a_sweep_is_asked_for_by_true_or_by_options():
     assert sweeps.DenseSweep.from_options(asked).options == standard | asked
 
 
+@pytest.mark.slow
 def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():
     room = SyntheticRoom(hw=(150, 200), n_frames=8, supersample=1, step_m=0.03)
     calls = []

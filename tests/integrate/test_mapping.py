@@ -216,6 +216,7 @@ def test_help_shows_every_option(command):
         assert word in out
 
 
+@pytest.mark.slow
 def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
     code, out, err = command(*SWEPT, "cutoff=2.0", "dense={planes: 32, size: 160}", "mesh=false", "output=here")
     assert code == 0, err

@@ -68,6 +68,7 @@ def test_tokens_of_the_conditions_hold_what_their_names_say():
     assert (recovered > 0).float().mean() > 0.2 and (recovered[recovered > 0] - 1.0).abs().median() < 0.05
 
 
+@pytest.mark.slow
 def test_a_policy_learns_what_its_tokens_show():
     g = torch.Generator().manual_seed(0)
     n = 128

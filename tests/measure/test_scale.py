@@ -75,6 +75,7 @@ def test_views_without_names_are_found_by_their_pictures(tmp_path):
     assert abs(result.scale / true - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_views_of_other_pictures_are_registered(tmp_path):
     """Every second picture belongs to the model, the others are the capture's."""
     made.write_pictures(tmp_path)

@@ -176,6 +176,7 @@ def honest(n, seed=0, boast=0.0):
     return errors.make_points(torch.where(good, 2.02, 3.0).double(), true, claimed)
 
 
+@pytest.mark.slow
 def test_excess_ece_forgives_chance_and_nothing_else():
     few, many = (sum(reliability.excess_ece(honest(n, seed)) for seed in range(8)) / 8 for n in (40, 4000))
     assert few < 0.03 and many < 0.005

@@ -1554,6 +1554,7 @@ def run_workers(count, folders, monkeypatch):
     return dict(zip(folders, map(json.loads, done.stdout.splitlines()), strict=True))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked")
 def test_every_worker_of_a_loader_takes_a_sound_library_and_leaves_another(cache, tmp_path, monkeypatch):
@@ -1566,6 +1567,7 @@ def test_every_worker_of_a_loader_takes_a_sound_library_and_leaves_another(cache
             assert "(torch is used)" in heard[0] and loader.COMMAND in heard[0], name
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked")
 def test_workers_that_start_while_the_library_is_replaced_have_a_whole_one(cache, tmp_path, monkeypatch):
@@ -1700,6 +1702,7 @@ def test_the_command_says_what_it_does_and_takes_no_options():
         assert said.returncode == code and loader.COMMAND in said.stdout
 
 
+@pytest.mark.slow
 def test_a_compiler_that_is_missing_or_fails_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", "no-such-compiler-7")

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import degenerate
 from degenerate_pairs import HW, KINDS, make
 
-N = 3 * len(KINDS)
+N = 2 * len(KINDS)
 
 
 def alone(number, pair=None):

@@ -184,6 +184,7 @@ def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(vi
     assert float(fused._shared_error(few)) == 0
 
 
+@pytest.mark.slow
 def test_complete_depth_and_the_method_give_one_product(views, found):
     estimate, trace = found
     again = {}
@@ -195,6 +196,7 @@ def test_complete_depth_and_the_method_give_one_product(views, found):
             assert torch.equal(getattr(again["fused"], name).nan_to_num(), getattr(estimate, name).nan_to_num()), name
 
 
+@pytest.mark.slow
 def test_without_the_stage_the_map_is_the_sweep_alone(views):
     method, trace = METHOD.replace(complete=None), {}
     with torch.no_grad():

@@ -66,6 +66,7 @@ def test_a_wrong_prior_does_not_lower_coverage():
         assert trace["fit"].ok.all()
 
 
+@pytest.mark.slow
 def test_a_right_prior_does_not_lower_coverage_with_several_views():
     (whole, *others), poses = orbit(15, -15, 25)
     views, prior = stack(others), stack([make_prior(T) for T in poses])
@@ -76,6 +77,7 @@ def test_a_right_prior_does_not_lower_coverage_with_several_views():
     assert len(trace["views"]) == 3
 
 
+@pytest.mark.slow
 def test_of_many_views_those_are_selected_that_a_prior_shows_from_a_similar_side():
     (whole, *others), poses = orbit(90, 15, -60, -15)
     views, prior = stack(others), stack([make_prior(T) for T in poses])
@@ -135,6 +137,7 @@ def test_without_a_guide_nothing_is_searched():
     assert len(calls) == 3  # under the prior's pose, under the refined one, and for what no track answers
 
 
+@pytest.mark.slow
 def test_a_prior_lifts_no_limit_of_a_method_without_a_guide():
     """Nor of the frozen methods: near returns that contradict far tracks stay contradicted."""
     (whole, other), (T,) = orbit(6)

@@ -83,6 +83,7 @@ def alike(a, b):
     )
 
 
+@pytest.mark.slow
 def test_a_plain_function_in_every_stage_answers_as_the_stage_itself(room):
     assert alike(PLAIN(room[0], room[3]), USUAL(room[0], room[3]))
     others = pytree.stack([room[k] for k in (1, 2, 3)])
@@ -121,6 +122,7 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
     assert all((rows[0][k] == rows[1][k]).all() for k in columns)
 
 
+@pytest.mark.slow
 def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
     from dhtorch.cli import job  # noqa: PLC0415
     from dhtorch.experiments import report  # noqa: PLC0415

@@ -173,6 +173,7 @@ def test_a_rig_that_is_not_rigid_has_no_pose() -> None:
         average_poses(each[:, :0], cov[:, :0], valid[:, :0])
 
 
+@pytest.mark.slow
 def test_a_robots_cameras_are_measured_once() -> None:
     left, right = cameras(0), cameras(1)
     found = estimate_rig_pose(left, right, method=MAP.replace(n=400))

@@ -100,6 +100,7 @@ def test_after_a_reset_it_is_as_new(frames: list[Frame]) -> None:
         assert same(stream.push(frames[k]), fresh.push(frames[k]))
 
 
+@pytest.mark.slow
 def test_the_command_streams_a_recording(tmp_path, capsys) -> None:
     options = ["data=synthetic", "data.n_frames=4", "data.hw=[192,256]", "method.n=256", "method.views=2"]
     assert main(["stream", *options, "max_frames=3", "cutoff=2.0", f"output={tmp_path}"]) == 0

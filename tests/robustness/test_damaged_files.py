@@ -32,7 +32,7 @@ from dhtorch import data
 from dhtorch.data import FormatError
 
 SAMPLES = CAPTURES | OTHER_INPUTS
-FEW, MUTANTS, MANY = 7, 15, 2000  # of every format: more where few do no damage; the many run with the slow tests
+FEW, MUTANTS, MANY = 4, 15, 2000  # of every format: more where few do no damage; the many run with the slow tests
 #: Captures by name; the other inputs, which ``make fuzz`` reads too, run with the slow tests.
 NAMES = [*CAPTURES, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHER_INPUTS)]
 
@@ -56,9 +56,9 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
     assert counts.total() == MANY
 
 
-#: Formats of every seventh kind with few examples; the others, and many of all, run with the slow tests.
+#: Formats of every fourteenth kind with few examples; the others, and many of all, run with the slow tests.
 EXAMPLES = [
-    *(pytest.param(name, 3, marks=[pytest.mark.slow] * (k % 7 > 0)) for k, name in enumerate(SAMPLES)),
+    *(pytest.param(name, 3, marks=[pytest.mark.slow] * (k % 14 > 0)) for k, name in enumerate(SAMPLES)),
     *(pytest.param(name, 80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)]) for name in SAMPLES),
 ]
 

@@ -199,6 +199,7 @@ def test_triangulation_is_papers_to_rounding():
         )
 
 
+@pytest.mark.slow
 def test_the_methods_agree_on_the_built_in_room():
     """Geometric means over three pairs: coverage of the holes within a tenth, error of their depth within .9 to 1.15."""
     recording = room(hw=(120, 160), path="walk", n_frames=17, lidar="exact")
@@ -319,6 +320,7 @@ def test_inference_mode_changes_no_bit(pair):
 # ------------------------------------------------------------------------------------------------ rare inputs
 
 
+@pytest.mark.slow
 def test_a_pair_answers_alone_as_among_others_within_rounding():
     frames = views(D), views(D, numbers=(14, 1))
     several = KORNIA(*(pytree.collate([pair[k] for pair in frames]) for k in (0, 1)), n=128)

@@ -62,6 +62,7 @@ def test_a_right_pose_is_used_as_it_is(pairs, method):
     assert (fit.matched_convention == 0).all() and fit.n_inlier.amin() > 50
 
 
+@pytest.mark.slow
 def test_a_stated_covariance_makes_sigma_honest(pairs):
     T = se3.relative(*pairs[3])
     shares, wide, narrow = [], [], []

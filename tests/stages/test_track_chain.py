@@ -298,6 +298,7 @@ def test_gradient_is_that_of_the_tracker(track, register):
     assert not any(getattr(chain, name).requires_grad for name in ("error", "photometric", "cov"))
 
 
+@pytest.mark.slow
 def test_chunks_of_pairs_have_their_own_images():
     images, uv = sequence(4), points(9)
     other = [image.flip(-1) for image in images]

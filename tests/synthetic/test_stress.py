@@ -100,6 +100,7 @@ def test_depth_noise_is_two_to_three_percent(walk):
     assert 0.02 < (frame.depth[said] / walk[0].depth[said] - 1).std() < 0.03
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other():
     rolling = room("rolling_shutter", image_noise=0.0)
     first, last = rolling.bands[3][:1], rolling.bands[3][-1:]
@@ -144,6 +145,7 @@ def test_three_in_ten_tracks_end_elsewhere_and_say_nothing_of_it(walk):
     assert torch.equal(alone.uv_1[0], spoiled.uv_1[1])
 
 
+@pytest.mark.slow
 def test_experiments_ask_the_spoiled_tracker():
     method = extend.replace(n=256)
     found = []

@@ -449,6 +449,7 @@ def test_it_pickles_and_copies(sample):
 # ---------------------------------------------------------------------------------------------------- tokens
 
 
+@pytest.mark.slow
 def test_tokens_stand_beside_dinov2_and_both_learn():
     transformers = pytest.importorskip("transformers")
     source = room()

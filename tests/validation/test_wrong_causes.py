@@ -92,6 +92,7 @@ def test_a_near_return_that_agrees_keeps_a_pixel(true, reference, selected):
     assert (validation.state[wrong] == State.WRONG).sum() < 0.2 * (alone.state[wrong] == State.WRONG).sum()
 
 
+@pytest.mark.slow
 def test_a_ghost_is_named_by_points_below_the_minimum_range(room, true):
     pose = room[ANCHOR].T_world_from_cam
     reference, card_depth = add_near_card(room[ANCHOR], pose, seed=0)

@@ -77,6 +77,7 @@ def command(tmp_path, monkeypatch, capsys):
 # ----------------------------------------------------------------------------------------------- what there is to see
 
 
+@pytest.mark.slow
 def test_a_result_finds_its_data_wherever_it_is_and_is_called_from(command, tmp_path, monkeypatch):
     room = SyntheticRoom(hw=(60, 80), n_frames=3, lidar="exact", supersample=1)
     writers.write_counted_frames(tmp_path / "capture", [room[i] for i in range(3)])
@@ -127,6 +128,7 @@ def test_what_was_held_back_is_apart(scene):
         assert shot.depth_image.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
+@pytest.mark.slow
 def test_swept_pixels_are_a_cloud_of_their_own(scene):
     for shot in scene.shots:
         view, swept = scene.views[shot.view_0], shot.swept
@@ -161,6 +163,7 @@ def test_a_method_that_chooses_sweeps_what_it_chose():
     assert len(found.shots) == 1 and found.shots[0].facts["views"] and len(found.shots[0].swept.xyz) > 500
 
 
+@pytest.mark.slow
 def test_without_a_trajectory_every_pair_stands_alone():
     whole = SyntheticRoom(hw=(60, 80), n_frames=4)
     room = Changed(whole, lambda frame: frame.replace(T_world_from_cam=None), poses=None)
@@ -381,6 +384,7 @@ def test_a_recording_is_read_back_as_computed(recorded, scene):
 # --------------------------------------------------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_a_result_is_shown_as_it_was_archived(job, command, tmp_path):
     code, out, err = command("view", job, "html=page.html")
     assert (code, err) == (0, "") and "page.html" in out
