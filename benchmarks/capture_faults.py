@@ -249,7 +249,7 @@ def run_row(frames: Frames, layout: str, fault: PlantedFault, sound: Sound | Non
             check = check_capture(recording)
             right = sound is not None and is_right(recording, sound, len(frames) - len(spoilt))
     except (data.FormatError, ValueError) as error:
-        return {"outcome": "refused", "causes": [], "lines": [str(error)[:300]]}
+        return {"outcome": "refused", "causes": [], "lines": [str(error).replace(str(root), "capture")[:300]]}
     lines = [*check.lines, *(str(w.message) for w in caught if issubclass(w.category, UserWarning))]
     lines = [line for line in lines if line != check.assumed_unit]
     causes = [finding.cause for finding in check.findings]
@@ -262,7 +262,7 @@ def run_row(frames: Frames, layout: str, fault: PlantedFault, sound: Sound | Non
         outcome = "named"
     else:
         outcome = "otherwise" if lines else "unchecked" if check.limits and "scale" in fault.causes else "silent"
-    return {"outcome": outcome, "causes": causes, "lines": [line[:200] for line in lines]}
+    return {"outcome": outcome, "causes": causes, "lines": [line.replace(str(root), "capture")[:200] for line in lines]}
 
 
 class Sound(NamedTuple):

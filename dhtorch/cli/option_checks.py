@@ -119,6 +119,9 @@ _COUNT_NAMES += ("steps", "hw", "depth_hw", "tokens_hw", "tokens", "shard_rows",
 _NONNEGATIVE_NAMES = re.compile(
     r".*_(px|m|rel|hz)|(min|max|sigma)_.*|metres|seconds|tolerance|foveation|near|range_limit|window"
 )
+#: Options with the name of a count that may be 0, which means none.
+_ZERO_OPTIONS = ("extract.gap",)
+
 #: Parameters that may be negative: below zero they disable a test, or they have a direction.
 _SIGNED_NAMES = ("max_rise", "min_score", "min_correlation")
 
@@ -297,6 +300,8 @@ def _check_value(name: str, value: Any, hint: Any) -> None:
     key = name.rpartition(".")[2]
     if not _matches_hint(value, hint):
         raise ValueError(f"{name}: found {_format_value(value)}, expected {_describe_hint(hint)}")
+    if name in _ZERO_OPTIONS:
+        return
     low = 1 if key in _COUNT_NAMES else 0 if _NONNEGATIVE_NAMES.fullmatch(key) and key not in _SIGNED_NAMES else None
     for each in value if isinstance(value, list) else [value]:
         if low is not None and _is_number(each) and each < low:

@@ -131,6 +131,24 @@ def test_anchors_of_which_there_are_none_are_as_good_as_they_would_have_said():
         assert noise[int(near)] == 1, "near answers, far ones"
 
 
+def test_degrees_of_freedom_that_are_stated_are_those_of_near_references():
+    references = points()
+    depth = references.depth.clone()
+    depth[0, :4] *= 1.1
+    references = references._replace(depth=depth)
+    task = AlignmentProblem(
+        references, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), references.x[:, :1]
+    )
+    scale = torch.tensor([[list(ERROR_MODELS).index("scale")]])
+    for near in (True, False):
+        alone = task._replace(points=references._replace(near=torch.full_like(references.near, near)))
+        heads = [
+            error_model.fit_models(alone, scale, references.used, freedom=torch.tensor([freedom]).double()).head
+            for freedom in (2.0, 200.0)
+        ]
+        assert torch.equal(*heads) is not near
+
+
 def test_far_answers_lean_together_and_near_returns_do_not():
     references = points()
     far = torch.arange(40)[None] % 2 == 0

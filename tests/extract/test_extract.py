@@ -114,6 +114,14 @@ def live(root, **options):
     return ExtendedDataset(Items(root), ExtendDepth(method=method, n=N, **views, **options), gap=GAP)
 
 
+def test_a_gap_of_zero_reads_no_second_view(robot, command):
+    code, out, err = command(*asked(robot, "extract.columns=[depth]", gap=0))
+    assert code == 0 and err == "" and "12 no second view" in out
+    assert len(FeatureTable("features")) == sum(LENGTHS)
+    code, _, err = command(*asked(robot, gap=-1))
+    assert code == 2 and "extract.gap: found -1, expected a whole number of at least 0" in err
+
+
 @pytest.mark.slow
 def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     code, out, err = command(*asked(robot))

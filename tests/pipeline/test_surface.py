@@ -193,6 +193,14 @@ def test_windows_that_hardly_fit_have_no_say(scene, monkeypatch):
     assert not bool((mapped(scene, min_correlation=0.0).source == Source.SWEPT).any())
 
 
+def test_pixels_below_the_least_correlation_are_untracked(scene, monkeypatch):
+    changed(monkeypatch, lambda _view, f: f._replace(correlation=0 * f.correlation + 0.6))
+    below, above = mapped(scene, min_correlation=0.65), mapped(scene, min_correlation=0.55)
+    assert int((above.source == Source.SWEPT).sum()) > 100
+    assert bool((below.gate[below.source == Source.NONE] == Gate.NO_TRACK).all())
+    assert not bool((below.source == Source.SWEPT).any())
+
+
 def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):
     def of_the_second(view, f):
         return f._replace(correlation=0 * f.correlation + 0.6) if view.T_1_from_0.t[0, 0] > 0 else f

@@ -97,7 +97,7 @@ def _command_row(case: Path, command: Mapping[str, Any], out: Path) -> Row:
         "truth": None,
         "right": right,
         "exit": code,
-        "output": text[-_MAX_OUTPUT_SHOWN:],
+        "output": text.replace(str(out.parent), "TMP")[-_MAX_OUTPUT_SHOWN:],
     }
 
 
