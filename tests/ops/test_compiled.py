@@ -841,6 +841,17 @@ def test_another_constant_has_a_file_of_its_own(monkeypatch):
     assert loader.library() != before
 
 
+@pytest.mark.parametrize(
+    ("owner", "name", "value"),
+    [(platform, "machine", lambda: "other"), (sys, "platform", "other"), (loader, "FLAGS", ["-O0"])],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_another_machine_or_command_has_a_file_of_its_own(monkeypatch, owner, name, value):
+    before = loader.library().name
+    monkeypatch.setattr(owner, name, value)
+    assert loader.file_name(loader.level()) != before
+
+
 def test_a_map_fits_into_the_kernel_and_a_level_is_padded_by_more_than_it_reads():
     assert max(*lk.TOP_RADII, *lk.MIDDLE_RADII, *lk.FINEST_RADII) <= constants.MAX_MAP_RADIUS_PX
     reach = pyramid.OUTSIDE_MARGIN_PX + constants.MAX_MAP_RADIUS_PX + 2
