@@ -85,6 +85,7 @@ class ReferenceView(Record):
     camera: Camera
     ray: Tensor  # (B, N, 3) z = 1; the optical axis where the lens model has no ray
     known: Tensor  # (B, N) bool, the lens model has a ray
+    ideal_uv: Tensor  # (B, 2, N) px, of the rays in the camera without its lens
     code: Tensor  # (B, h, w) int32, see census
 
     @property
@@ -162,7 +163,8 @@ def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
     has_ray = all_finite(ray, -1) if camera.distortion is not None else _has_focal_length(camera, ray)
     if not all_known(has_ray):
         ray = torch.where(has_ray[..., None], ray, constant(ray, [0.0, 0.0, 1.0]))
-    return ReferenceView(image, camera, ray, has_ray, census_transform(image.detach()))
+    ideal_uv = ray[..., :2].mT * camera.f[..., None] + camera.c[..., None]
+    return ReferenceView(image, camera, ray, has_ray, ideal_uv.contiguous(), census_transform(image.detach()))
 
 
 def _has_focal_length(camera: Camera, ray: Tensor) -> Tensor:
@@ -252,8 +254,7 @@ def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
     motion."""
     s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None]).mT
     f, c = base.camera.f[..., None], base.camera.c[..., None]
-    a = base.ray[..., :2].mT * f + c
-    return EpipolarWarp(a.contiguous(), s[:, :2] * f + c * s[:, 2:], s[:, 2])
+    return EpipolarWarp(base.ideal_uv, s[:, :2] * f + c * s[:, 2:], s[:, 2])
 
 
 def census_transform(grey: Tensor) -> Tensor:

@@ -139,17 +139,19 @@ def refine_surface(
     tolerance = options.surface_planes * spacing
     with torch.no_grad():
         warps = [plane_sweep.epipolar_warp(base, source_view.view) for source_view in source_views]
+        low, high = ((start.q + sign * max_shift).clamp_min(0) for sign in (-1, 1))
         at = windows.smooth_within_tolerance(start.q, tolerance)
         for _ in range(steps):
-            moved = at + _joint_step(base, source_views, warps, at, spacing, options)[0]
-            at = torch.minimum(torch.maximum(moved, start.q - max_shift), start.q + max_shift).clamp_min(0)
+            at = (at + _joint_step(base, source_views, warps, at, spacing, options)[0]).clamp(low, high)
             at = windows.smooth_within_tolerance(at, tolerance)
-    step, fit = _joint_step(base, source_views, warps, at, spacing, options, last=True)
+    step, sums = _joint_step(base, source_views, warps, at, spacing, options, last=True)
     if step.requires_grad:
         step = step / _step_derivative(base, source_views, warps, at, spacing, options)
     edge_sigma = options.edge_sigma_ratio * windows.window_range(at, options.edge_radius_px)
-    own = fit.own * (start.misfit / options.nominal_cost).square() + edge_sigma.square()
-    return fit._replace(q=at + (step - step.detach()), own=own)
+    own = 1 / sums.weight * (start.misfit / options.nominal_cost).square() + edge_sigma.square()
+    assert sums.shared is not None
+    shared = torch.where(sums.weight > 0, sums.shared / sums.weight, torch.inf)
+    return RefinedSurface(at + (step - step.detach()), own, shared, sums.best, sums.seen)
 
 
 @torch.no_grad()
@@ -179,16 +181,13 @@ def _joint_step(
     options: DenseOptions,
     *,
     last: bool = False,
-) -> tuple[Tensor, RefinedSurface]:
-    """The step (B, h, w) at inverse depths ``at``, the weighted mean of the views' steps, and the quality of the fit.
+) -> tuple[Tensor, _ViewSums]:
+    """The step (B, h, w) at inverse depths ``at``, the weighted mean of the views' steps, and the sums over the views.
 
     Weights are inverse variances. The variance by the motions (``shared``) is computed only for the ``last`` step.
     Gradient: of the step.
     """
-    zeros = torch.zeros_like(at)
-    sums = _ViewSums(
-        zeros, zeros.clone(), zeros.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool()
-    )
+    sums: _ViewSums | None = None
     for (view, picture, fit, use), warp in zip(source_views, warps, strict=True):
         window = plane_sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
@@ -196,11 +195,8 @@ def _joint_step(
             visible = window.seen & use[:, None, None] & ~occluded
             pose_var = pose_variance(base, view, fit, at, window.motion) if last else None
         sums = _add_view(sums, window, visible, options.max_step_planes * spacing, pose_var, options)
-    step = sums.step / sums.weight.clamp_min(MIN_WEIGHT)
-    own, shared = 1 / sums.weight, sums.shared
-    if last:
-        shared = torch.where(sums.weight > 0, shared / sums.weight, torch.inf)
-    return step, RefinedSurface(at, own, shared, sums.best, sums.seen)
+    assert sums is not None
+    return sums.step / sums.weight.clamp_min(MIN_WEIGHT), sums
 
 
 class _ViewSums(NamedTuple):
@@ -208,56 +204,64 @@ class _ViewSums(NamedTuple):
 
     step: Tensor
     weight: Tensor
-    shared: Tensor
-    best: Tensor  # largest correlation
+    best: Tensor  # largest correlation, -1 where no view sees the pixel
     seen: Tensor  # bool
+    shared: Tensor | None  # None without variances by motions
 
 
 def _add_view(
-    sums: _ViewSums,
+    sums: _ViewSums | None,
     window: plane_sweep.WindowFit,
     visible: Tensor,
     max_step: Tensor,
     pose_var: Tensor | None,
     options: DenseOptions,
 ) -> _ViewSums:
-    """The sums with one view more, for the pixels ``visible`` (B, h, w) in it.
+    """The sums, None before the first view, with one view more, for the pixels ``visible`` (B, h, w) in it.
 
     Its step is at most ``max_step`` (B,) 1/m; ``pose_var`` (B, h, w) 1/m² is the variance by its motion.
     """
     columns = window.step, window.contrast, window.noise, window.correlation
-    return _add_to_sums(*columns, visible, max_step, pose_var, *sums, options=options)
+    before = (None,) * len(_ViewSums._fields) if sums is None else sums
+    return _add_to_sums(*columns, visible, max_step, pose_var, *before, options=options)
 
 
 def _add_to_sums_kernel(*tensors: Tensor | None, options: DenseOptions) -> _ViewSums:
-    *columns, max_step, pose_var, step, weight, shared, best, seen = tensors
-    sums = _ViewSums(step, weight, shared, best, seen)  # type: ignore[arg-type]
-    variance = step.new_empty(0) if pose_var is None else pose_var  # type: ignore[union-attr]
+    columns, pose_var, before = tensors[:6], tensors[6], tensors[7:]
+    first = before[0] is None
+    if first:
+        step, *_, visible, _ = columns
+        like = step, step, step, visible, pose_var
+        before = tuple(None if x is None else torch.empty_like(x) for x in like)
+    *sums, shared = before
+    none = columns[0].new_empty(0)  # type: ignore[union-attr]
+    variances = (none, none) if pose_var is None else (pose_var, shared)
     limits = options.grey_noise**2, options.independent_window_pixels, options.min_window_correlation
-    torch.ops.dhtorch.add_view.default(*columns, max_step, variance, *sums, *limits)  # in place
-    return sums
+    torch.ops.dhtorch.add_view.default(*columns, *variances, *sums, *limits, first)  # in place
+    return _ViewSums(*before)  # type: ignore[arg-type]
 
 
 @operator(
     kernel=_add_to_sums_kernel,
     dtypes=dict.fromkeys(("step", "contrast", "noise", "correlation"), torch.float32)
     | {"visible": torch.bool}
-    | dict.fromkeys(("max_step", "pose_var", "sum_step", "sum_weight", "sum_shared", "best"), torch.float32)
-    | {"seen": torch.bool},
+    | dict.fromkeys(("max_step", "pose_var", "sum_step", "sum_weight", "best"), torch.float32)
+    | {"seen": torch.bool, "sum_shared": torch.float32},
 )
 def _add_to_sums(*tensors: Any, options: DenseOptions) -> _ViewSums:
     """:func:`_add_view` of the fields of a window fit and of the sums; it may overwrite the latter."""
-    step, contrast, noise, correlation, visible, max_step, pose_var, sum_step, sum_weight, sum_shared, best, seen = (
-        tensors
-    )
+    step, contrast, noise, correlation, visible, max_step, pose_var, *before = tensors
+    zeros = torch.zeros_like(correlation)
+    first = zeros, zeros, torch.full_like(zeros, -1), torch.zeros_like(visible), zeros
+    sum_step, sum_weight, best, seen, sum_shared = first if before[0] is None else before
     with torch.no_grad():
         own = (noise + options.grey_noise**2) / (options.independent_window_pixels * contrast)
         weight = torch.where(visible & (correlation > options.min_window_correlation), 1 / own, 0.0)
-        shared = sum_shared if pose_var is None else sum_shared + weight * pose_var
+        shared = None if pose_var is None else sum_shared + weight * pose_var
         best = torch.where(visible, torch.maximum(best, correlation), best)
     limit = max_step[:, None, None]
     total = sum_step + weight * torch.minimum(torch.maximum(step, -limit), limit)
-    return _ViewSums(total, sum_weight + weight, shared, best, seen | visible)
+    return _ViewSums(total, sum_weight + weight, best, seen | visible, shared)
 
 
 def pose_variance(

@@ -321,10 +321,11 @@ void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor co
 
 // Add a view's fit to the sums total, weight and, if there is a variance, shared, and update best and seen, all (B, h, w).
 // step, contrast, noise, correlation: fields of WindowFit; here: whether the view sees the pixel; most (B): largest step.
-// grey_variance: of a pixel; independent: independent pixels in a window; min_correlation: below it the weight is 0.
+// grey_variance: of a pixel; independent: independent pixels in a window; min_correlation: below it the weight is 0;
+// first: the sums are overwritten.
 void add_view(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance,
-              Tensor total, Tensor weight, Tensor shared, Tensor best, Tensor seen, double grey_variance, double independent,
-              double min_correlation) {
+              Tensor shared, Tensor total, Tensor weight, Tensor best, Tensor seen, double grey_variance, double independent,
+              double min_correlation, bool first) {
   const int64_t B = step.size(0), N = step.size(1) * step.size(2);
   const bool motion = variance.size(0) == B;
   const float least = static_cast<float>(grey_variance), count = static_cast<float>(independent),
@@ -339,17 +340,18 @@ void add_view(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Te
     float* __restrict top = data<float>(best) + at;
     bool* __restrict any = data<bool>(seen) + at;
     const float* __restrict wide = data<float>(variance) + (motion ? at : 0);
-    float* __restrict common = data<float>(shared) + at;
+    float* __restrict common = data<float>(shared) + (motion ? at : 0);
     for (int64_t n = 0; n < N; ++n) {
       const float own = (left[n] + least) / (count * clear[n]);
       const float now = (shown[n] & (alike[n] > from)) ? 1.0f / own : 0.0f;
       float by = move[n] < -limit ? -limit : move[n];
       by = by > limit ? limit : by;
-      sum[n] = sum[n] + now * by;
-      all[n] = all[n] + now;
-      top[n] = (shown[n] & (alike[n] > top[n])) ? alike[n] : top[n];
-      any[n] = any[n] | shown[n];
-      if (motion) common[n] = common[n] + now * wide[n];
+      const float before = first ? -1.0f : top[n];
+      sum[n] = (first ? 0.0f : sum[n]) + now * by;
+      all[n] = (first ? 0.0f : all[n]) + now;
+      top[n] = (shown[n] & (alike[n] > before)) ? alike[n] : before;
+      any[n] = first ? shown[n] : any[n] | shown[n];
+      if (motion) common[n] = (first ? 0.0f : common[n]) + now * wide[n];
     }
   }
 }
@@ -366,8 +368,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "float min_inverse_depth, float min_squared_motion, float min_abs_depth) -> ()");
   m.def(
       "add_view(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance, "
-      "Tensor(a!) total, Tensor(b!) weight, Tensor(c!) shared, Tensor(d!) best, Tensor(e!) seen, "
-      "float grey_variance, float independent, float min_correlation) -> ()");
+      "Tensor(a!) shared, Tensor(b!) total, Tensor(c!) weight, Tensor(d!) best, Tensor(e!) seen, "
+      "float grey_variance, float independent, float min_correlation, bool first) -> ()");
   m.def(
       "fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor little, Tensor(a!) step, "
       "Tensor(b!) contrast, Tensor(c!) noise, Tensor(d!) correlation, Tensor(e!) inside, Tensor(f!) motion, "
