@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -142,13 +144,14 @@ def test_the_map_has_returns_swept_pixels_and_joint_answers_at_samples(views, fo
     assert bool((answered == (sensed | is_estimated(depth_map.source))).all())
 
 
-def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
-    swept = complete_map = fused.DepthMap(
+def inserted(*, weight=1.0, usable=(False, False, False)):
+    """Three joint answers of the same ``weight`` in a map of 5 x 5 pixels whose first one is answered; two are at (1, 1)
+    beside it."""
+    swept = fused.DepthMap(
         *(torch.full((1, 5, 5), v) for v in (torch.nan, torch.nan, 0.0)),
         torch.zeros(1, 5, 5, dtype=torch.int32),
         torch.full((1, 5, 5), Gate.NO_TRACK, dtype=torch.int32),
     )
-    swept = swept.replace(gate=swept.gate.clone())
     swept.gate[0, 0, 0] = Gate.ANSWER
     at = torch.tensor([[[1.0, 1.0], [4.0, 4.0], [1.0, 1.0]]])
     one = torch.ones(1, 3)
@@ -157,16 +160,23 @@ def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
         residual_px=one, n_views=2 * one.int(), score=torch.tensor([[0.3, 0.9, 0.6]]), gate=0 * one.int(),
     )  # fmt: skip
     answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int(), one[None])
-    joint = fused._Joint(one.bool(), one, one, answer, answer)
+    joint = fused._Joint(one.bool(), weight * one, one, answer, answer)
+    selected = SimpleNamespace(samples=SimpleNamespace(usable=torch.tensor([usable])))
+    return fused._insert(swept, at, estimate, selected, joint)  # type: ignore[arg-type]
 
-    class Selected:
-        class samples:
-            usable = torch.zeros(1, 3, dtype=torch.bool)
 
-    got = fused._insert(swept, at, estimate, Selected, joint)  # type: ignore[arg-type]
+def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
+    got = inserted()
     assert float(got.depth[0, 1, 1]) == 4.0  # of two samples at a pixel that with the larger score
     assert bool(got.depth[0, 4, 4].isnan()) and int(got.gate[0, 4, 4]) == Gate.NO_TRACK
-    assert int(got.source[0, 1, 1]) == Source.RECOVERED and complete_map.gate[0, 0, 0] == Gate.NO_TRACK
+    assert int(got.source[0, 1, 1]) == Source.RECOVERED
+
+
+def test_a_joint_answer_has_the_source_of_larger_weight_and_none_is_at_a_return():
+    assert int(inserted(weight=0.4).source[0, 1, 1]) == Source.SWEPT
+    assert int(inserted(weight=0.6).source[0, 1, 1]) == Source.RECOVERED
+    assert float(inserted(usable=(False, False, True)).depth[0, 1, 1]) == 2.0
+    assert bool(inserted(usable=(True, False, True)).depth[0, 1, 1].isnan())
 
 
 def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(views, found):
