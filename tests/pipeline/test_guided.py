@@ -2,17 +2,21 @@
 
 import math
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
 from support.rooms import room
 
 from dhtorch.codes import Gate, Hole
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import se3
 from dhtorch.metrics import errors, holdout
+from dhtorch.pipeline import pair
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Pose
+from dhtorch.records import Pose, Samples, Tracks
+from dhtorch.stages.guided_search import GuidedMatches
 from dhtorch.stages.pose_prior import make_prior
 
 HW = (120, 160)
@@ -147,3 +151,49 @@ def test_a_prior_lifts_no_limit_of_a_method_without_a_guide():
     refused = PLAIN(seen, other, fit=prior, **strict)
     assert not refused.keep.any() and (refused.gate == Gate.CONTRADICTED).any()
     assert GUIDED(seen, other, fit=prior, **strict).keep.any(), "the guide's poses agree with the prior"
+
+
+def test_a_prior_is_confirmed_by_a_pose_that_is_near_it_in_turn_and_translation():
+    T = Pose(torch.eye(3)[None], torch.tensor([[0.1, 0.0, 0.0]]))
+    fit = known_pose_fit(T, 8)
+    about_y = torch.tensor([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
+
+    def agrees(turn=0.0, scale=1.0):
+        return bool(pair._agrees(fit, Pose(se3.exp(turn * about_y).R, scale * T.t)))
+
+    assert agrees() and agrees(turn=0.9 * pair.MAX_PRIOR_TURN_RAD) and agrees(scale=0.9)
+    assert not agrees(turn=1.5 * pair.MAX_PRIOR_TURN_RAD) and not agrees(scale=0.5)
+
+
+def test_only_unique_matches_that_correlate_become_tracks(monkeypatch):
+    """Matches of six samples in one view: not unique, at no place, answered already, with a return, and two good ones,
+    of which one correlates too little."""
+    n = 6
+    uv, zeros = torch.rand(1, n, 2), torch.zeros(1, n)
+    no = zeros.bool()
+    fourth = torch.tensor([[k == 3 for k in range(n)]])
+    samples = Samples(
+        uv=uv, depth=zeros, sigma=zeros, xyz=torch.where(fourth[..., None], torch.ones(1, n, 3), torch.nan),
+        confidence=zeros, flag=zeros.int(), trackability=zeros + 1, hole=zeros.int(),
+    )  # fmt: skip
+    eye = torch.eye(2).expand(1, n, 2, 2)
+    tracks = Tracks(uv_0=uv, uv_1=uv, error=zeros, photometric=zeros, cov=eye, valid=no)
+    found = GuidedMatches(
+        uv_1=uv[None] + 1, cov=eye[None], ncc=torch.full((1, 1, n), 0.9), rms=zeros[None],
+        unique=torch.tensor([[k != 0 for k in range(n)]]),
+    )  # fmt: skip
+    found.uv_1[0, 0, 1] = torch.nan
+    found.ncc[0, 0, 4] = 0.5
+    estimate = SimpleNamespace(keep=torch.tensor([[k == 2 for k in range(n)]]))
+    picture = torch.zeros(1, 3, 8, 8)
+    views = pair._Views(
+        GUIDED,
+        SimpleNamespace(image=picture),
+        SimpleNamespace(image=picture[None]),
+        samples,  # type: ignore[arg-type]
+    )
+    monkeypatch.setattr(pair, "_search_matches", lambda *_: found)
+    fit = SimpleNamespace(T_1_from_0=None)
+    tried = pair._answer_matches(views, (tracks, estimate, tracks, fit), lambda new, _: new, lambda _, x: x)
+    assert tried.valid.tolist() == [[False] * 5 + [True]]
+    assert torch.equal(tried.uv_1[0, 5], uv[0, 5] + 1) and torch.equal(tried.uv_1[0, :5], uv[0, :5])
