@@ -197,3 +197,19 @@ def test_only_unique_matches_that_correlate_become_tracks(monkeypatch):
     tried = pair._answer_matches(views, (tracks, estimate, tracks, fit), lambda new, _: new, lambda _, x: x)
     assert tried.valid.tolist() == [[False] * 5 + [True]]
     assert torch.equal(tried.uv_1[0, 5], uv[0, 5] + 1) and torch.equal(tried.uv_1[0, :5], uv[0, :5])
+
+
+def test_places_of_matches_move_with_the_picture():
+    frames = room(n_frames=2, hw=HW)
+    reference, other = frames[0], stack([frames[0]])
+    picture = reference.image.float().div(255) if reference.image.dtype == torch.uint8 else reference.image.clone()
+    picture.requires_grad_()
+    uv = torch.tensor([[[40.0, 60.0], [80.0, 50.0], [110.0, 70.0]]])
+    views = pair._Views(GUIDED, reference.replace(image=picture), other, SimpleNamespace(uv=uv))  # type: ignore[arg-type]
+    matches = SimpleNamespace(uv_1=uv[None])
+    places = pair._differentiable_places(views, matches)  # type: ignore[arg-type]
+    assert torch.equal(places, uv[None])
+    (slope,) = torch.autograd.grad(places.sum(), picture)
+    assert slope.isfinite().all() and slope.abs().max() > 1e-3
+    with torch.no_grad():
+        assert not pair._differentiable_places(views, matches).requires_grad  # type: ignore[arg-type]
