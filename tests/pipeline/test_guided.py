@@ -15,7 +15,7 @@ from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline import pair
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Pose, Samples, Tracks
+from dhtorch.records import Estimate, Pose, Samples, Tracks
 from dhtorch.stages.guided_search import GuidedMatches
 from dhtorch.stages.pose_prior import make_prior
 
@@ -165,21 +165,31 @@ def test_a_prior_is_confirmed_by_a_pose_that_is_near_it_in_turn_and_translation(
     assert not agrees(turn=1.5 * pair.MAX_PRIOR_TURN_RAD) and not agrees(scale=0.5)
 
 
+def samples_of(n, returns=()):
+    """Textured samples (1, n), those of ``returns`` with a return."""
+    uv, zeros = torch.rand(1, n, 2), torch.zeros(1, n)
+    xyz = torch.full((1, n, 3), torch.nan)
+    xyz[0, list(returns)] = 1.0
+    return Samples(
+        uv=uv, depth=zeros, sigma=zeros, xyz=xyz, confidence=zeros, flag=zeros.int(), trackability=zeros + 1,
+        hole=zeros.int(),
+    )  # fmt: skip
+
+
+def tracks_of(samples):
+    """Tracks of no valid sample, that stay where they are."""
+    zeros, uv = torch.zeros_like(samples.depth), samples.uv
+    eye = torch.eye(2).expand(*zeros.shape, 2, 2)
+    return Tracks(uv_0=uv, uv_1=uv, error=zeros, photometric=zeros, cov=eye, valid=zeros.bool())
+
+
 def test_only_unique_matches_that_correlate_become_tracks(monkeypatch):
     """Matches of six samples in one view: not unique, at no place, answered already, with a return, and two good ones,
     of which one correlates too little."""
-    n = 6
-    uv, zeros = torch.rand(1, n, 2), torch.zeros(1, n)
-    no = zeros.bool()
-    fourth = torch.tensor([[k == 3 for k in range(n)]])
-    samples = Samples(
-        uv=uv, depth=zeros, sigma=zeros, xyz=torch.where(fourth[..., None], torch.ones(1, n, 3), torch.nan),
-        confidence=zeros, flag=zeros.int(), trackability=zeros + 1, hole=zeros.int(),
-    )  # fmt: skip
-    eye = torch.eye(2).expand(1, n, 2, 2)
-    tracks = Tracks(uv_0=uv, uv_1=uv, error=zeros, photometric=zeros, cov=eye, valid=no)
+    n, samples = 6, samples_of(6, returns=(3,))
+    tracks, uv = tracks_of(samples), samples.uv
     found = GuidedMatches(
-        uv_1=uv[None] + 1, cov=eye[None], ncc=torch.full((1, 1, n), 0.9), rms=zeros[None],
+        uv_1=uv[None] + 1, cov=tracks.cov[None], ncc=torch.full((1, 1, n), 0.9), rms=tracks.error[None],
         unique=torch.tensor([[k != 0 for k in range(n)]]),
     )  # fmt: skip
     found.uv_1[0, 0, 1] = torch.nan
@@ -197,6 +207,20 @@ def test_only_unique_matches_that_correlate_become_tracks(monkeypatch):
     tried = pair._answer_matches(views, (tracks, estimate, tracks, fit), lambda new, _: new, lambda _, x: x)
     assert tried.valid.tolist() == [[False] * 5 + [True]]
     assert torch.equal(tried.uv_1[0, 5], uv[0, 5] + 1) and torch.equal(tried.uv_1[0, :5], uv[0, :5])
+
+
+def test_of_several_results_that_with_most_answers_without_a_return_is_taken():
+    samples = samples_of(4, returns=(1, 2))
+    fit = known_pose_fit(Pose(torch.eye(3)[None], torch.zeros(1, 3)), 4)
+    results = []
+    for k, kept in enumerate(((0, 1, 2), (0, 1, 3), (0, 3))):
+        estimate = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2)
+        estimate.gate[0, list(kept)] = Gate.ANSWER
+        tracks = tracks_of(samples).replace(error=torch.full((1, 4), float(k)))
+        results.append((tracks, estimate, tracks, fit))
+    tracks, estimate, _, _ = pair._most_answers(samples, results)
+    assert tracks.error.tolist() == [[2.0] * 4], "the last of two with two answers; the first has one"
+    assert estimate.keep.tolist() == [[True, False, False, True]]
 
 
 def test_places_of_matches_move_with_the_picture():

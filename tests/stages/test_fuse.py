@@ -211,7 +211,6 @@ def room():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_small_pictures_choose_views_as_large_ones_do(room):
     frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
     reference = frames[0]
@@ -234,6 +233,20 @@ def test_each_reference_of_a_batch_gets_its_own_views(room):
     ).index
     for b in range(2):
         assert select_views_by_preview(references[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
+
+
+def test_previews_are_of_every_reference_and_view_and_ranked_by_the_even_samples(room, monkeypatch):
+    references, candidates = collate([room[0], room[11]]), stack([collate([room[k], room[11 - k]]) for k in (1, 3, 6)])
+    estimated, ranked = [], []
+    pairs, rank = view_selection._preview_pairs, view_selection.rank_views
+    monkeypatch.setattr(view_selection, "_preview_pairs", lambda *a: estimated.append(a) or pairs(*a))
+    monkeypatch.setattr(view_selection, "rank_views", lambda x, *a, **k: ranked.append(x) or rank(x, *a, **k))
+    select_views_by_preview(references, candidates, 1, near=16)
+    (frames, samples, others, _), (estimate,) = estimated[0], ranked
+    own = view_selection._preview_samples(frames, 16)
+    assert torch.equal(samples.depth, own.depth) and not torch.equal(samples.depth[0], samples.depth[1])
+    assert len(others.image) == 6 and torch.equal(frames.image[0], frames.image[2])
+    assert estimate.depth.shape == (3, 2, view_selection.PREVIEW_METHOD.n) != samples.depth.shape
 
 
 def test_a_small_frame_sees_the_same_rays(room):
@@ -292,3 +305,11 @@ def test_views_are_selected_by_what_they_add_and_the_later_of_equals():
     selection = view_selection._select_greedily(information, 2)
     assert selection.index.tolist() == [[0], [2]]
     assert selection.gain.flatten().tolist() == pytest.approx([math.log(21), math.log(2) + math.log(25 / 21)])
+
+
+def test_a_preference_is_added_to_the_gain_where_views_are_selected_and_not_to_the_gain_itself():
+    information = torch.tensor([[3.0], [1.0], [1.0]])[:, None]
+    preference = torch.tensor([0.0, 5.0, 0.0])[:, None]
+    selection = view_selection._select_greedily(information, 1, preference)
+    assert selection.index.tolist() == [[1]]
+    assert selection.gain.flatten().tolist() == pytest.approx([math.log(2)])
