@@ -179,6 +179,22 @@ def test_a_joint_answer_has_the_source_of_larger_weight_and_none_is_at_a_return(
     assert bool(inserted(usable=(True, False, True)).depth[0, 1, 1].isnan())
 
 
+def test_a_joint_depth_is_the_mean_of_inverse_depths():
+    one = torch.ones(1, 2)
+    sparse = fused.Estimate(
+        uv=torch.zeros(1, 2, 2), depth=2 * one, sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
+        residual_px=one, n_views=2 * one.int(), score=one, gate=0 * one.int(),
+    )  # fmt: skip
+    kinds = [
+        fused._Answers(one.bool(), one / d, 0.1 * one, one, one, one.int(), one.expand(5, 1, 2)) for d in (2.0, 4.0)
+    ]
+    joint = fused._Joint(one.bool(), torch.tensor([[0.5, 0.75]]), one, *kinds)
+    selected = SimpleNamespace(joined=sparse, samples=SimpleNamespace(usable=torch.zeros(1, 2, dtype=torch.bool)))
+    got = fused._joint_estimate(selected, joint, 0.1)  # type: ignore[arg-type]
+    torch.testing.assert_close(got.depth, 1 / torch.tensor([[0.375, 0.4375]]))
+    torch.testing.assert_close(got.sigma, 0.1 * got.depth)
+
+
 def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(views, found):
     _, trace = found
     selected = selected_views(trace["sparse"], views[1], trace)
