@@ -443,6 +443,17 @@ def test_another_camera_of_the_instant_is_another_view():
 
 
 @pytest.mark.parametrize(
+    ("every", "most", "numbers"), [(1, None, [0, 1, 2]), (1, 2, [0, 1]), (2, None, [0, 2]), (2, 1, [0])]
+)
+def test_scenes_are_cut_to_every_so_many_frames_and_to_the_first(every, most, numbers):
+    scenes = [Scene(each) for each in pair_of_cameras()]
+    for scene, whole in zip(cut.subsample_scenes(scenes, every, most), scenes, strict=True):
+        assert scene.recording.number.tolist() == whole.recording.number[numbers].tolist()
+        for k, place in enumerate(numbers):
+            assert torch.equal(scene.recording[k].image, whole.recording[place].image)
+
+
+@pytest.mark.parametrize(
     ("name", "key"),
     [
         ("image_0", "image_0"),

@@ -228,7 +228,7 @@ def test_frames_that_are_decoded_already_are_not_decoded_again(frames, true):
 
 @pytest.mark.slow
 def test_little_is_enough(frames, true):
-    """One frame, no depth, no texture, and sparse depth: no finding and no error."""
+    """One frame, no depth, no texture: no finding and no error."""
     assert check_capture(recording(frames[:1], true[:1])).findings == ()
     empty = [f.replace(depth=torch.zeros_like(f.depth)) for f in frames]
     assert check_capture(recording(empty, true)).findings == ()
@@ -236,10 +236,13 @@ def test_little_is_enough(frames, true):
     check = check_capture(recording(grey, state_poses(true, parse_pose_convention("opengl"))))
     assert check.poses_refuted, "surfaces alone refute the poses"
     assert check_capture(recording(grey, true)).findings == ()
-    sparse = check_capture(recording(frames, state_poses(true, parse_pose_convention("mm")), sparse=True))
-    assert sparse.poses is None and not sparse.poses_refuted
     lost = Pose(true.R, torch.full_like(true.t, torch.nan))
     assert check_capture(recording(frames, lost)).poses is None
+
+
+def test_poses_are_not_checked_by_sparse_depth(frames, true):
+    check = check_capture(recording(frames, state_poses(true, parse_pose_convention("mm")), sparse=True))
+    assert check.poses is None and check.diagnosis is None and not check.poses_refuted
 
 
 def test_pictures_of_two_sizes_are_checked_without_tracks(frames, true):
