@@ -99,7 +99,6 @@ def test_one_number_that_is_missing_is_told_from_two(expected, scale, shift, see
     assert error(found, truth) < 0.001
 
 
-@pytest.mark.slow
 def test_a_shift_makes_no_sense_of_maps_without_a_metre():
     truth, near, far = world()
     for kind in ("scale", "affine", "inverse"):
@@ -118,7 +117,6 @@ def test_kinds_of_maps(kind):
     assert error(align_depth(x, [near, far], kind=kind), truth) < (0.05 if kind == "ordinal" else 0.01)
 
 
-@pytest.mark.slow
 def test_wrong_anchors_are_outvoted():
     truth, near, far = world()
     wrong = torch.arange(far.depth.shape[1]) % 5 == 0
@@ -126,13 +124,11 @@ def test_wrong_anchors_are_outvoted():
     assert error(align_depth(0.8 * truth, [near, far]), truth) < 0.01
 
 
-@pytest.mark.slow
 def test_an_error_that_far_answers_share_does_not_move_the_map():
     truth, near, far = world()
     assert error(align_depth(truth, [near, far.replace(depth=1.03 * far.depth)]), truth) < 0.005
 
 
-@pytest.mark.slow
 def test_a_map_of_answers_is_an_anchor_too_and_samples_may_be_of_a_larger_picture():
     truth, near, _ = world()
     one = torch.full_like(truth, 0, dtype=torch.int32)
@@ -207,7 +203,6 @@ def test_nearly_half_of_the_anchors_may_be_wrong():
     assert error(align_depth(0.8 * truth, [lost, far]), truth) < 0.01
 
 
-@pytest.mark.slow
 def test_far_answers_that_are_all_wrong_alike_do_not_move_a_map_that_near_returns_confirm():
     truth, near, far = world()
     for factor in (0.9, 1.1):
@@ -247,7 +242,6 @@ def test_summary_and_verdict_of_the_study():
     assert align_study.verdict({})[0] is None
 
 
-@pytest.mark.slow
 def test_exact_returns_outweigh_edges_that_an_affine_map_would_hide():
     """What blurs the edges of a map leaves most returns exact: the map is not bent until its edges look better."""
     truth, near, far = world(noise=0.0, n=600)
@@ -278,7 +272,6 @@ def test_a_handful_of_anchors_is_no_answer(left):
     assert (align_depth(truth, some).gate == Gate.NO_POSE).all()
 
 
-@pytest.mark.slow
 def test_near_returns_alone_are_enough():
     truth, near, far = world()
     none = far.replace(gate=torch.full_like(far.gate, Gate.NO_BASELINE))
@@ -296,7 +289,6 @@ def test_anchors_that_are_all_wrong_are_no_reason_to_be_sure():
     assert not kept.any() or float((found.sigma / found.depth)[kept].median()) > 0.1
 
 
-@pytest.mark.slow
 def test_a_power_that_near_returns_do_not_refute_is_part_of_sigma():
     """Near returns of some noise tell a bent map no better by a power than by a line; exact ones refute the power."""
     truth, near, _ = world(noise=0.005)
@@ -396,7 +388,6 @@ def test_a_rising_line_through_what_rises_is_what_it_goes_through():
     assert (found.diff() >= -1e-12).all() and ((found / (1 + x.flatten() ** 2)).log().abs() < 0.35).all()
 
 
-@pytest.mark.slow
 def test_a_pixel_that_is_not_sure_enough_is_silent():
     truth, near, far = world()
     x, _ = depth_faults.apply_fault("simulated", truth)

@@ -185,7 +185,6 @@ def worth_of_a_scale(scale):
     return float(found.evidence), float(whole)
 
 
-@pytest.mark.slow
 def test_evidence_is_an_integral_over_what_was_believed_possible():
     """Laplace's: off by how much a tail bends, alike wherever the scale lies; far from what was believed it is worth
     less."""

@@ -82,7 +82,6 @@ def test_what_the_source_had_is_there_value_for_value(robot, enriched):
     assert {k: after[k] for k in before} == before
 
 
-@pytest.mark.slow
 def test_no_feature_but_pictures_of_three_channels_is_an_image(robot, enriched, tmp_path):
     """LeRobot's policies take every image and video as such a picture, and want statistics of each."""
     assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "maps=images", "columns=[depth,source]"]) == 0
@@ -145,7 +144,6 @@ def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots)
         assert np.abs(depth - frame.depth[0].numpy())[sensor].max() <= STEP / 2 + 1e-6
 
 
-@pytest.mark.slow
 def test_what_is_known_to_less_than_half_a_step_is_known_to_one(robot, tmp_path):
     """Depth in whole metres: nothing that has a depth is said to have none, or to be known exactly."""
     assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "step=1"]) == 0
@@ -213,7 +211,6 @@ def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
     assert read_files(out) == read_files(enriched)
 
 
-@pytest.mark.slow
 def test_other_options_and_other_folders_are_refused(robot, enriched, tmp_path, capsys):
     assert main(["enrich", str(robot), str(enriched), *ASKED, "step=0"]) == 2
     assert "step 0.0009765625 there, 0 here" in capsys.readouterr().err
@@ -237,7 +234,6 @@ def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tm
     assert copied.read_bytes() == (source / "videos" / "chunk-000" / CAMERA / "episode_000001.mp4").read_bytes()
 
 
-@pytest.mark.slow
 def test_one_episode_of_an_older_set_is_counted_from_0_in_its_own_version(shots, tmp_path):
     source = robot_set(tmp_path / "old", shots, 2)
     out = tmp_path / "new"
@@ -336,7 +332,6 @@ def test_every_format_that_is_read_was_written_in_every_format_or_refused():
         assert refusal in row["refused"] if "refused" in row else row["compared"] > 0
 
 
-@pytest.mark.slow
 def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     """As GR00T's sets: the first row bears a time that the video does not know."""
     source = robot_set(tmp_path / "set", shots, 2)

@@ -128,7 +128,6 @@ def test_a_cluster_gives_the_same_bytes(robot, whole, tmp_path):
     assert read_files(enrich(robot, tmp_path / "set", "engine=ray")) == read_files(whole)
 
 
-@pytest.mark.slow
 def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
     source = tmp_path / "source"
     shutil.copytree(robot, source)
@@ -179,7 +178,6 @@ def test_tasks_that_are_noted_for_an_episode_are_kept(version, tmp_path):
     assert {row["task_index"] for row in read_rows(out)} == {0}
 
 
-@pytest.mark.slow
 def test_splits_are_in_the_new_numbers(tmp_path):
     source = tmp_path / "source"
     source.mkdir()
@@ -192,6 +190,21 @@ def test_splits_are_in_the_new_numbers(tmp_path):
 
     assert splits(tmp_path / "all") == {"train": "0:2", "val": "2:3"}
     assert splits(tmp_path / "one", "data=lerobot", "data.episode=2") == {"val": "0:1"}
+
+
+def test_a_source_has_episodes_of_its_splits_rows_up_to_its_limit_and_the_files_that_are_not_rewritten(tmp_path):
+    writers.write_lerobot(tmp_path, [shots(3), shots(2, 3)], depth="tiff")
+    info = tmp_path / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"splits": {"train": "0:1", "val": "1:2"}}))
+    for name in ("notes.txt", "meta/stats.json", "meta/other.json"):
+        (tmp_path / name).write_text("{}")
+    source = LeRobotSource.open(tmp_path, [0, 1], limit=2)
+    assert source.splits == {"train": [0], "val": [1]}
+    assert [sum(part.num_rows for part in source.batches(k, [])) for k in (0, 1)] == [2, 2]
+    whole = LeRobotSource.open(tmp_path, [0])
+    assert sum(part.num_rows for part in whole.batches(0, [])) == 3
+    assert {"notes.txt", "meta/other.json"} <= source.more.keys()
+    assert not {"meta/info.json", "meta/stats.json", "meta/tasks.parquet"} & source.more.keys()
 
 
 def test_a_video_that_no_episode_has_is_no_feature_of_the_new_set(tmp_path):
@@ -258,7 +271,6 @@ def test_samples_alone(whole):
         assert 0 < found.sum() <= 64
 
 
-@pytest.mark.slow
 def test_an_older_version_of_the_format(robot, whole, tmp_path):
     one = tmp_path / "older"
     one.mkdir()
@@ -305,7 +317,6 @@ def test_the_whole_is_never_held(tmp_path, monkeypatch):
 # ---------------------------------------------------------------------------------------------------- other sources
 
 
-@pytest.mark.slow
 def test_steps_of_robots_keep_what_they_say(tmp_path):
     """RLDS: numbers, texts, splits, and pictures as they are encoded."""
     source = tmp_path / "1.0.0"
@@ -404,7 +415,6 @@ def test_counts_of_an_episode_are_sums_and_shares_along_it():
     assert (found["frames"], found["unread"]) == (48, 1)
 
 
-@pytest.mark.slow
 def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
     source = tmp_path / "source"
     source.mkdir()

@@ -122,7 +122,6 @@ def test_a_gap_of_zero_reads_no_second_view(robot, command):
     assert code == 2 and "extract.gap: found -1, expected a whole number of at least 0" in err
 
 
-@pytest.mark.slow
 def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     code, out, err = command(*asked(robot))
     assert code == 0 and err == "", err
@@ -144,7 +143,6 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     assert sum(int(row["dhtorch.pose_ok"]) for row in features) == 6
 
 
-@pytest.mark.slow
 def test_rows_join_the_data_set_by_episode_and_frame(robot, command):
     assert command(*asked(robot))[0] == 0
     ours = pyarrow.concat_tables(parquet.read_table(p) for p in files("features"))
@@ -271,7 +269,6 @@ def damaged(tmp_path, shots):
     ]
 
 
-@pytest.mark.slow
 def test_a_corrupt_frame_raises_in_one_line(damaged, command):
     code, _, err = command(*damaged, "workers=1")
     assert code == 2 and "Traceback" not in err and len(without_notes(err)) == 1, err
@@ -280,7 +277,6 @@ def test_a_corrupt_frame_raises_in_one_line(damaged, command):
     assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]
 
 
-@pytest.mark.slow
 def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
     code, out, err = command(*damaged, "extract.on_error=skip")
     assert code == 0 and not without_notes(err), err
@@ -291,7 +287,6 @@ def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
     assert "(3 left untouched), 7 rows" in out and "1 skipped" in out, "counts are kept with the shards"
 
 
-@pytest.mark.slow
 def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
     code, out, _ = command(*damaged, "extract.on_error=flag", "workers=1")
     assert code == 0 and "8 rows" in out and "1 unreadable" in out

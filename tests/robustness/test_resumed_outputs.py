@@ -70,7 +70,6 @@ def once(robot: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.slow
 def test_an_enriched_set_that_is_enriched_again_has_its_own_records_and_can_be_resumed(
     robot: Path, once: Path, tmp_path: Path
 ) -> None:
@@ -104,7 +103,6 @@ def test_the_lens_of_a_camera_that_is_not_enriched_is_kept(once: Path) -> None:
     assert json.loads((once / "meta" / "intrinsics.json").read_text()) == {WRIST: {"dist": pytest.approx(LENS)}}
 
 
-@pytest.mark.slow
 def test_without_a_report_there_is_no_report_of_another(robot: Path, tmp_path: Path) -> None:
     assert enrich(robot, tmp_path / "set", "data=lerobot", f"data.camera={FRONT}", "report=false") == 0
     assert (
@@ -191,7 +189,6 @@ def test_unfinished_files_of_a_dead_run_are_removed(robot: Path, tmp_path: Path)
 # ----------------------------------------------------------------------------------------------------------- long names
 
 
-@pytest.mark.slow
 def test_a_camera_whose_video_would_have_too_long_a_name_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

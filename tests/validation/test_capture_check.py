@@ -122,7 +122,6 @@ def test_turned_depth_is_named_with_its_turn(turn, frames, true):
     assert torch.equal(undone(check, spoilt)[2].depth, frames[2].depth)
 
 
-@pytest.mark.slow
 def test_a_factor_near_1_is_a_scale_without_a_culprit(frames, true):
     check = check_capture(recording([f.replace(depth=1.1 * f.depth) for f in frames], true))
     (finding,) = check.findings
@@ -198,7 +197,6 @@ def test_intrinsics_of_larger_pictures_are_named(frames):
     assert "the intrinsics look like those of pictures 1.98 times as large" in finding.text
 
 
-@pytest.mark.slow
 def test_the_window_is_where_the_camera_moves_and_broken_frames_are_left_out(frames, true):
     """A capture that stands still, then walks; frames are decoded only in the window, unreadable ones left out."""
     still = 30

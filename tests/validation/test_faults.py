@@ -143,7 +143,6 @@ def test_a_unit_is_named(name, own, frames, watched):
     assert diagnose(shown, maps, method=METHOD, watched=watched).cause == name
 
 
-@pytest.mark.slow
 def test_a_scale_that_is_no_unit_is_not_named(frames, watched):
     shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
     for factor in (1.6, 0.5, 7.0):
@@ -221,7 +220,6 @@ def test_a_camera_that_stands_still_names_faults_of_maps_by_near_returns(name, f
     assert (found.kind, found.by, found.n_pairs) == (kind, "returns", 6)
 
 
-@pytest.mark.slow
 def test_a_camera_that_is_said_to_stand_still_is_one(frames, still):
     """Tracks that do not move fit every depth alike, whatever the trajectory."""
     held = [f.replace(T_world_from_cam=frames[0].T_world_from_cam) for f in still]

@@ -1,6 +1,7 @@
 """Poses beside depth: the true reading is named among all that are tried, by surfaces alone and by tracks."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Pose, Samples, Tracks
+from dhtorch.validation import pose_check
 from dhtorch.validation.pose_check import (
     PoseCheck,
     PoseReading,
@@ -209,6 +211,17 @@ def test_readings_are_distinct_and_the_stated_one_is_first():
     assert {r.lag for r in readings} == set(range(-5, 6))
     assert sum(r.convention.inverse for r in readings) == 24
     assert all(r.is_small_factor == (0.67 < r.factor < 1.5 and r.convention.unit != "m") for r in readings)
+
+
+def test_a_scale_error_goes_unnoticed_up_to_the_factors_whose_score_is_hardly_worse():
+    """Scores that rise by the square of the factor's logarithm: steeply, hardly, and on one side alone."""
+    readings = [r for r in pose_readings() if r.is_small_factor or r == NONE]
+    log = torch.tensor([math.log(r.factor) for r in readings], dtype=torch.float64)
+    error = partial(pose_check._unnoticed_scale_error, readings, track=None)
+    steep, fine = error(1 + 1e4 * log**2), error(1 + 30 * log**2)
+    assert steep == pose_check._MIN_FACTOR_OFFSET < fine < math.exp(float(log.abs().max())) - 1
+    assert error(1 + 0 * log) == math.inf
+    assert error(1 + 1e4 * log.clamp(min=0) ** 2) == error(1 + 1e4 * log.clamp(max=0) ** 2) == math.inf
 
 
 def check_of(stated, best_score, best=UP_BACK, without=0.1, tracks=None, factor=1.0):

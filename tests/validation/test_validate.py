@@ -292,7 +292,6 @@ def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, tru
     assert not off.scale[0, 1] <= 1 <= off.scale[0, 2]
 
 
-@pytest.mark.slow
 def test_no_depth_is_never_right_or_wrong(true, reference, others):
     holes = true.clone()
     holes[:, :, :120] = torch.nan
@@ -391,7 +390,6 @@ def test_a_map_without_pixels_is_refused():
         validate_depth(torch.zeros(1, 0, 0), room[0], None)
 
 
-@pytest.mark.slow
 def test_options_change_what_they_name(true, reference, others, sound):
     """One option of each kind: evidence, states and numbers of the frame."""
     maps = {"depth_map": true, "reference": reference, "others": others}

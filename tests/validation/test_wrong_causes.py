@@ -92,7 +92,6 @@ def test_a_near_return_that_agrees_keeps_a_pixel(true, reference, selected):
     assert (validation.state[wrong] == State.WRONG).sum() < 0.2 * (alone.state[wrong] == State.WRONG).sum()
 
 
-@pytest.mark.slow
 def test_a_ghost_is_named_by_points_below_the_minimum_range(room, true):
     pose = room[ANCHOR].T_world_from_cam
     reference, card_depth = add_near_card(room[ANCHOR], pose, seed=0)
@@ -153,6 +152,16 @@ def test_a_pixel_between_two_sides_flies_and_a_thin_line_does_not():
     line = two_sides()
     line[0, :, 8] = 1.5
     assert not flying_evidence(line, tolerance).misfit.isfinite().any()
+
+
+def test_a_few_pixels_are_no_side():
+    """Two pixels before one that is nearer than its background."""
+    depth = torch.full((1, 12, 16), 2.0)
+    depth[0, 5, 8], depth[0, 5, 9], depth[0, 6, 9] = 1.7, 1.0, 1.0
+    tolerance = torch.full_like(depth, 0.025)
+    assert not flying_evidence(depth, tolerance).misfit.isfinite().any()
+    depth[0, 4, 9] = 1.0
+    assert flying_evidence(depth, tolerance).misfit.isfinite().nonzero().tolist() == [[0, 5, 8]]
 
 
 def test_a_pixel_that_differs_without_two_sides_does_not_fly():
