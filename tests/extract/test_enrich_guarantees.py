@@ -35,7 +35,7 @@ from dhtorch.data.readers.rlds import StepFeature
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.export.lerobot import N_BINS
-from dhtorch.extract import cut, plan
+from dhtorch.extract import cut, origin, plan
 from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, camera_feature, camera_key, map_columns
 from dhtorch.extract.instants import PeekableRows
 from dhtorch.extract.nerf_target import NerfstudioTarget
@@ -205,6 +205,15 @@ def test_a_source_has_episodes_of_its_splits_rows_up_to_its_limit_and_the_files_
     assert sum(part.num_rows for part in whole.batches(0, [])) == 3
     assert {"notes.txt", "meta/other.json"} <= source.more.keys()
     assert not {"meta/info.json", "meta/stats.json", "meta/tasks.parquet"} & source.more.keys()
+
+
+def test_rows_without_frame_index_are_counted_over_all_groups(tmp_path, monkeypatch):
+    writers.write_lerobot(tmp_path, [shots(3)], depth="tiff")
+    (file,) = (tmp_path / "data").rglob("*.parquet")
+    parquet.write_table(parquet.read_table(file).drop_columns("frame_index"), file)
+    monkeypatch.setattr(origin, "TABLE_GROUP_ROWS", 2)
+    groups = list(LeRobotSource.open(tmp_path, [0]).batches(0, []))
+    assert [part["frame_index"].to_pylist() for part in groups] == [[0, 1], [2]]
 
 
 def test_a_video_that_no_episode_has_is_no_feature_of_the_new_set(tmp_path):
