@@ -847,9 +847,10 @@ def test_another_constant_has_a_file_of_its_own(monkeypatch):
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_another_machine_or_command_has_a_file_of_its_own(monkeypatch, owner, name, value):
-    before = loader.library().name
+    level = loader.level()
+    before = loader.file_name(level)
     monkeypatch.setattr(owner, name, value)
-    assert loader.file_name(loader.level()) != before
+    assert loader.file_name(level) != before
 
 
 def test_a_map_fits_into_the_kernel_and_a_level_is_padded_by_more_than_it_reads():
