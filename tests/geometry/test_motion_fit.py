@@ -78,3 +78,11 @@ def test_sigma_of_the_flow_is_of_one_coordinate():
     _, sigma = scene_flow(still, cov, seen.xyz, seen.used, (seen.f, seen.c))
     moved = (500 * 0.01 / seen.xyz[:, 2]).square() / 2
     torch.testing.assert_close(sigma, moved.median(-1).values.sqrt())
+
+
+def test_of_several_starts_the_one_that_fits_best_is_kept():
+    _, seen = sightings()
+    back = se3.exp(torch.tensor([[0.0, 3.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64))
+    for starts in ((back, se3.identity(1, seen.f)), (se3.identity(1, seen.f), back)):
+        result = fit_motion(seen, collate(starts), GROUP, overlap=1.0, rotation_only=False)
+        assert float(se3.log(se3.compose(result.T, se3.invert(T))).abs().max()) < 1e-6
