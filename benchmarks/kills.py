@@ -1,6 +1,6 @@
 """Faults in the command's sleep: killed, told to end, raced, and out of disk, again and again; what is lost is counted.
 
-    python benchmarks/kills.py --times 50 --json benchmarks/results/kills.json
+    python benchmarks/kills.py --times 17 --json benchmarks/results/kills.json
 
 Every fault hits ``dhtorch extract``, ``enrich`` (two workers each) and ``complete`` on a small set, at a moment drawn
 from the seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody

