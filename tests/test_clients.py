@@ -71,11 +71,13 @@ def robot(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_actions_and_depth_of_two_cameras_arrive_together(robot, client):
     said = client("torch_loader", robot / "set", 0)
     assert said["target"] == "action" and said["frames"] == 12 and said["tokens_known"] > 5
 
 
+@pytest.mark.slow
 def test_actions_state_and_statistics_are_kept(robot):
     """What LeRobot normalises by is there for both cameras, and the arm's numbers are the source's."""
     stats = json.loads((robot / "set" / "meta" / "stats.json").read_text())
@@ -94,6 +96,7 @@ def test_actions_state_and_statistics_are_kept(robot):
     assert np.allclose(stats["action"]["mean"], found.mean(0)) and np.ptp(found, 0).min() >= 0
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_video_ends_a_loader_of_tables_in_a_sentence(robot, client, tmp_path):
     info = json.loads((robot / "set" / "meta" / "info.json").read_text())
     for name in ("observation.images.left", "observation.images.right"):
@@ -114,12 +117,14 @@ def pictured(robot, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_groot_reads_geometry_images_by_its_modality(pictured, client):
     said = client("groot_modality", pictured)
     assert said["frames"] == 12 and said["missing"] == [] and said["parts"] == 2 and said["pictures"] == 24
     assert said["known"] > 100 and said["largest_difference"]["inverse depth"] <= 0.5 / (255 * NEAREST_M) * 1.001
 
 
+@pytest.mark.slow
 def test_openpi_resizes_geometry_images_without_new_codes(pictured, client):
     pytest.importorskip("openpi_client")
     assert client("openpi_transforms", pictured)["geometry_known"] > 0.05

@@ -74,6 +74,7 @@ def test_a_normal_run_of_any_word_says_nothing_on_stderr(said):
     assert done.stdout.partition("\x00")[2].strip() == str([0] * 7)
 
 
+@pytest.mark.slow
 def test_files_have_names_that_every_system_takes(said):
     folder, _ = said
     names = {part for p in folder.rglob("*") for part in p.relative_to(folder).parts}
@@ -261,6 +262,7 @@ def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch)
     assert [p.name for p in Path("sheets").glob("*.png")] == [re.search(r"sheets/(\S+png)", out)[1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "module", "name"),
     [

@@ -26,10 +26,10 @@ from dhtorch.viz.plots.markup import Markup, escape_html, make_tag
 REPO = Path(__file__).resolve().parents[2]
 NAMES = [make.__name__ for make in archived.ALL]
 every = pytest.mark.parametrize("result", NAMES, indirect=True)
-#: Every third kind; the others among the slow tests.
+#: Every sixth kind; the others among the slow tests.
 some = pytest.mark.parametrize(
     "result",
-    [pytest.param(name, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, name in enumerate(NAMES)],
+    [pytest.param(name, marks=[pytest.mark.slow] * (k % 6 > 0)) for k, name in enumerate(NAMES)],
     indirect=True,
 )
 

@@ -168,6 +168,7 @@ def test_a_candidate_with_a_return_of_the_sensor_raises_with_the_scene():
         range_split.require_no_returns(rows(3).rows, "full")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "experiment",
     [
@@ -356,6 +357,7 @@ def test_census_counts_every_class_once():
     assert full.verdict == "undecided", "no hole, no census"
 
 
+@pytest.mark.slow
 def test_calibration_reads_thresholds_off_the_same_answers():
     thresholds = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.5)
     outcome = asked(calibration, small_room(lidar="exact"), thresholds=thresholds)
@@ -455,6 +457,7 @@ NAMES = sorted({path.stem for path in (config_dir() / "experiment").glob("*.yaml
 QUICK = ("heldout", "hole_census")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES])
 def test_every_experiment_of_the_settings_runs_from_the_command(name, tmp_path, capsys):
     small = ["data.hw=[96,128]", "figures=false", "method.n=256", f"output={tmp_path}", *SMALLER.get(name, ())]

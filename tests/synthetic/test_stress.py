@@ -196,6 +196,7 @@ def carried(recording, i, j, motion=None):
     return inside, depth, (image.T - grey).abs().mean(-1), surface, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in MOVING_ROOMS if name != "convoy_lanes"])
 def test_background_stands_and_the_body_goes_as_said(name):
     """Truth against render: what is carried to another frame by the right motion has its depth and its grey there."""
@@ -246,6 +247,7 @@ def test_bodies_go_with_the_viewer_half_as_far_in_his_hand_or_round():
     assert torch.allclose(angle, torch.full_like(angle, guests._TURN_DEG_PER_FRAME), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [("convoy", 0.99, 1), ("convoy_slow", 0.99, 1), ("turntable", 0.99, 1), ("held_object", 0.35, 0.65)],
