@@ -1714,7 +1714,6 @@ def test_the_command_says_what_it_does_and_takes_no_options():
         assert said.returncode == code and loader.COMMAND in said.stdout
 
 
-@pytest.mark.slow
 def test_a_compiler_that_is_missing_or_fails_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", "no-such-compiler-7")

@@ -101,7 +101,6 @@ def test_silence_has_reasons_and_no_value(found):
     assert bool((found.depth[found.keep] > 0).all()) and bool((found.sigma[found.keep] > 0).all())
 
 
-@pytest.mark.slow
 def test_a_camera_that_only_turns_gets_the_sensor_alone():
     room = SyntheticRoom(n_frames=6, hw=(240, 320), depth_hw=(120, 160), path="rotation")
     with torch.no_grad():

@@ -210,7 +210,6 @@ def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(vi
     assert float(fused._shared_error(few)) == 0
 
 
-@pytest.mark.slow
 def test_complete_depth_and_the_method_give_one_product(views, found):
     estimate, trace = found
     again = {}
