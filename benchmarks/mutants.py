@@ -306,11 +306,18 @@ def by_rule(source: str, module: str) -> Iterator[Fault]:
         inside = source[first:last]
         tree = ast.parse(_dedented(inside))
         flat = _dedented(inside).splitlines(keepends=True)
-        for node in ast.walk(tree):
+        unread = _annotations(tree)
+        for node in (x for x in ast.walk(tree) if x not in unread):
             for statement, (a, b), new in _changes(node, flat):
                 old, changed = _around(flat, statement, a, b, new)
                 if inside.count(old) == 1 and old != changed:
                     yield Fault(module, function, old, changed)
+
+
+def _annotations(tree: ast.AST) -> set[ast.AST]:
+    """Nodes of annotations, which Python does not evaluate here."""
+    fields = (getattr(node, name, None) for node in ast.walk(tree) for name in ("annotation", "returns"))
+    return {node for field in fields if field is not None for node in ast.walk(field)}
 
 
 def _cpp_by_rule(source: str, module: str) -> Iterator[Fault]:

@@ -104,3 +104,10 @@ def test_pictures_are_spread_evenly():
 def test_the_verdict_of_an_episode_needs_half_of_its_pictures(verdicts, expected):
     result = SimpleNamespace(verdict=torch.tensor(verdicts))
     assert pin.Episode("e", list(range(len(verdicts))), result, torch.zeros(3, 4, 4)).verdict == expected
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("image", [torch.full((1, 4, 5), 51, dtype=torch.uint8), torch.full((1, 4, 5), 0.2)])
+def test_pictures_are_drawn_in_three_channels_of_bytes(image, channels):
+    drawn = pin._to_rgb(image.expand(channels, -1, -1))
+    assert drawn.shape == (4, 5, 3) and drawn.dtype == np.uint8 and (drawn == 51).all()

@@ -1,8 +1,10 @@
 """Check of a capture: each planted fault has a finding of its kind whose option undoes it; sound captures have none."""
 
+import math
 import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -310,3 +312,17 @@ def test_field_cases_are_named(name):
 def test_sound_captures_have_no_finding(name):
     check = check_capture(data.open_all(ROOT / name)[0])
     assert check.findings == () and check.recording.poses is not None
+
+
+def test_pairs_without_a_pose_so_many_frames_later_have_no_epipolar_distance(frames, true):
+    """The last pair has a pose one frame earlier, and none one frame later."""
+    n = len(frames)
+    uv = torch.rand(1, 20, 2, generator=torch.Generator().manual_seed(0)) * 50
+    sample, track = SimpleNamespace(uv=uv), SimpleNamespace(uv_1=uv, valid=torch.ones(1, 20, dtype=torch.bool))
+    tracks = SimpleNamespace(samples=[sample], tracks=[track])
+
+    def distance(by, pair):
+        return capture_check._epipolar_distance(true, by, dict(enumerate(frames)), [pair], tracks)
+
+    assert math.isnan(distance(1, (n - 2, n - 1))) and math.isnan(distance(-1, (0, 1)))
+    assert distance(-1, (n - 2, n - 1)) >= 0 and distance(1, (0, 1)) >= 0
