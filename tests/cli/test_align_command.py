@@ -28,7 +28,6 @@ def maps(tmp_path_factory, room):
     return folder
 
 
-@pytest.mark.slow
 def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     out = tmp_path / "out"
     asked = ["align", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="no_answer>0.9"']
