@@ -314,6 +314,14 @@ def by_rule(source: str, module: str) -> Iterator[Fault]:
                     yield Fault(module, function, old, changed)
 
 
+def _is_code(path: Path, fault: Fault) -> bool:
+    """Whether a file can be parsed with the fault; C++ is left to its compiler."""
+    try:
+        return path.suffix != ".py" or bool(ast.parse(planted(path.read_text(), fault)))
+    except SyntaxError:
+        return False
+
+
 def _annotations(tree: ast.AST) -> set[ast.AST]:
     """Nodes of annotations, which Python does not evaluate here."""
     fields = (getattr(node, name, None) for node in ast.walk(tree) for name in ("annotation", "returns"))
@@ -719,6 +727,7 @@ def main() -> int:
     if args.sweep:
         drawn = [f for m in wanted if m in TESTS for f in by_rule(known[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
+        faults = [fault for fault in faults if _is_code(known[fault.module], fault)]
     else:
         home = [(module_of(f.module, known), f) for f in FAULTS]
         faults = [f for m in wanted for f in [f for place, f in home if place == m][:: args.every]]
