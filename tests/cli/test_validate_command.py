@@ -282,7 +282,6 @@ def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
 OPTIONS = {"image": "image", "depth": "depth", "intrinsics": "intrinsics", "depth_unit": "mm", "n": 256}
 
 
-@pytest.mark.slow
 def test_a_loader_gets_verdicts_of_one_shape():
     transform = ValidateDepth(map="map", judging={"size": 64}, **OPTIONS)
     samples = []
