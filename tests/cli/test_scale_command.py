@@ -27,7 +27,6 @@ def model(tmp_path):
     return folder, true
 
 
-@pytest.mark.slow
 def test_a_model_is_written_in_metres(capture, model, capsys):
     folder, true = model
     assert run.main(["scale", str(folder), str(capture), "--cutoff", "2.5"]) == 0

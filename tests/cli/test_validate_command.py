@@ -54,7 +54,6 @@ def validated(out, *words, capsys=None):
     return code, json.loads((out / "validate.json").read_text())
 
 
-@pytest.mark.slow
 def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     out = tmp_path / "out"
     code, found = validated(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
