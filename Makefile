@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Python compiles a package where it is imported first: most of what is installed never is.
+# pip writes no byte code: Python compiles a module at its first import, and most installed modules are never imported.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 # Where torch's builds for the CPU are: on Linux pip's own choice brings CUDA, some gigabytes. `make TORCH_INDEX= run` leaves

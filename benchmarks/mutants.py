@@ -306,8 +306,8 @@ def by_rule(source: str, module: str) -> Iterator[Fault]:
         inside = source[first:last]
         tree = ast.parse(_dedented(inside))
         flat = _dedented(inside).splitlines(keepends=True)
-        unread = _annotations(tree)
-        for node in (x for x in ast.walk(tree) if x not in unread):
+        annotations = _annotations(tree)
+        for node in (x for x in ast.walk(tree) if x not in annotations):
             for statement, (a, b), new in _changes(node, flat):
                 old, changed = _around(flat, statement, a, b, new)
                 if inside.count(old) == 1 and old != changed:

@@ -119,11 +119,10 @@ _COUNT_NAMES += ("steps", "hw", "depth_hw", "tokens_hw", "tokens", "shard_rows",
 _NONNEGATIVE_NAMES = re.compile(
     r".*_(px|m|rel|hz)|(min|max|sigma)_.*|metres|seconds|tolerance|foveation|near|range_limit|window"
 )
-#: Options with the name of a count that may be 0, which means none.
-_ZERO_OPTIONS = ("extract.gap",)
-
 #: Parameters that may be negative: below zero they disable a test, or they have a direction.
 _SIGNED_NAMES = ("max_rise", "min_score", "min_correlation")
+#: Options with the name of a count that may be 0; their function checks them.
+_ZERO_OPTIONS = ("extract.gap",)
 
 #: Origins of annotations that accept a list.
 _LIST_TYPES = (list, tuple, collections.abc.Sequence, collections.abc.Iterable)
@@ -300,9 +299,8 @@ def _check_value(name: str, value: Any, hint: Any) -> None:
     key = name.rpartition(".")[2]
     if not _matches_hint(value, hint):
         raise ValueError(f"{name}: found {_format_value(value)}, expected {_describe_hint(hint)}")
-    if name in _ZERO_OPTIONS:
-        return
     low = 1 if key in _COUNT_NAMES else 0 if _NONNEGATIVE_NAMES.fullmatch(key) and key not in _SIGNED_NAMES else None
+    low = None if name in _ZERO_OPTIONS else low
     for each in value if isinstance(value, list) else [value]:
         if low is not None and _is_number(each) and each < low:
             kind = "a whole number of at least 1" if low else "a number of at least 0"

@@ -251,9 +251,10 @@ def _add_to_sums_kernel(*tensors: Tensor | None, options: DenseOptions) -> _View
 def _add_to_sums(*tensors: Any, options: DenseOptions) -> _ViewSums:
     """:func:`_add_view` of the fields of a window fit and of the sums; it may overwrite the latter."""
     step, contrast, noise, correlation, visible, max_step, pose_var, *before = tensors
-    zeros = torch.zeros_like(correlation)
-    first = zeros, zeros, torch.full_like(zeros, -1), torch.zeros_like(visible), zeros
-    sum_step, sum_weight, best, seen, sum_shared = first if before[0] is None else before
+    if before[0] is None:
+        zeros = torch.zeros_like(correlation)
+        before = [zeros, zeros, torch.full_like(zeros, -1), torch.zeros_like(visible), zeros]
+    sum_step, sum_weight, best, seen, sum_shared = before
     with torch.no_grad():
         own = (noise + options.grey_noise**2) / (options.independent_window_pixels * contrast)
         weight = torch.where(visible & (correlation > options.min_window_correlation), 1 / own, 0.0)

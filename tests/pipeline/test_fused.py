@@ -144,6 +144,15 @@ def test_the_map_has_returns_swept_pixels_and_joint_answers_at_samples(views, fo
     assert bool((answered == (sensed | is_estimated(depth_map.source))).all())
 
 
+def estimate_of(depth, score=1.0, uv=0.0):
+    """An estimate of samples with depth (1, N) m, all answered."""
+    one = torch.ones_like(depth)
+    return fused.Estimate(
+        uv=uv * torch.ones(*depth.shape, 2), depth=depth, sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
+        residual_px=one, n_views=2 * one.int(), score=score * one, gate=0 * one.int(),
+    )  # fmt: skip
+
+
 def inserted(*, weight=1.0, usable=(False, False, False)):
     """Three joint answers of the same ``weight`` in a map of 5 x 5 pixels whose first one is answered; two are at (1, 1)
     beside it."""
@@ -155,10 +164,7 @@ def inserted(*, weight=1.0, usable=(False, False, False)):
     swept.gate[0, 0, 0] = Gate.ANSWER
     at = torch.tensor([[[1.0, 1.0], [4.0, 4.0], [1.0, 1.0]]])
     one = torch.ones(1, 3)
-    estimate = fused.Estimate(
-        uv=at, depth=torch.tensor([[2.0, 3.0, 4.0]]), sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
-        residual_px=one, n_views=2 * one.int(), score=torch.tensor([[0.3, 0.9, 0.6]]), gate=0 * one.int(),
-    )  # fmt: skip
+    estimate = estimate_of(torch.tensor([[2.0, 3.0, 4.0]]), torch.tensor([[0.3, 0.9, 0.6]]), at)
     answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int(), one[None])
     joint = fused._Joint(one.bool(), weight * one, one, answer, answer)
     selected = SimpleNamespace(samples=SimpleNamespace(usable=torch.tensor([usable])))
@@ -181,15 +187,13 @@ def test_a_joint_answer_has_the_source_of_larger_weight_and_none_is_at_a_return(
 
 def test_a_joint_depth_is_the_mean_of_inverse_depths():
     one = torch.ones(1, 2)
-    sparse = fused.Estimate(
-        uv=torch.zeros(1, 2, 2), depth=2 * one, sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
-        residual_px=one, n_views=2 * one.int(), score=one, gate=0 * one.int(),
-    )  # fmt: skip
     kinds = [
         fused._Answers(one.bool(), one / d, 0.1 * one, one, one, one.int(), one.expand(5, 1, 2)) for d in (2.0, 4.0)
     ]
     joint = fused._Joint(one.bool(), torch.tensor([[0.5, 0.75]]), one, *kinds)
-    selected = SimpleNamespace(joined=sparse, samples=SimpleNamespace(usable=torch.zeros(1, 2, dtype=torch.bool)))
+    selected = SimpleNamespace(
+        joined=estimate_of(2 * one), samples=SimpleNamespace(usable=torch.zeros(1, 2, dtype=torch.bool))
+    )
     got = fused._joint_estimate(selected, joint, 0.1)  # type: ignore[arg-type]
     torch.testing.assert_close(got.depth, 1 / torch.tensor([[0.375, 0.4375]]))
     torch.testing.assert_close(got.sigma, 0.1 * got.depth)
