@@ -120,6 +120,9 @@ METHOD = (
 #: pytest's ``-k`` of this run.
 KEYWORD = [""]
 
+#: Functions that hand tensors to compiled code, and the tests that load it; all others are tried without it.
+KERNELS, COMPILED = "_kernel", ["tests/ops/test_compiled.py"]
+
 #: What the tests of a trial leave in its tree.
 FAILURE, TIMES = "first_failure.txt", "seconds.json"
 
@@ -584,14 +587,15 @@ def run(
     warm()
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         benches = [Bench(Path(folder) / str(k), tests) for k in range(jobs)]
-        clean = _clean(benches, sorted({m for m, _ in named}), tests_of)
-        whole = {module: sum(of.values()) for module, of in clean.items()}
+        clean = _clean(benches, sorted({(m, *tests_for(f, tests_of[m])) for m, f in named}))
 
         def one(k: int) -> dict[str, Any]:
             bench = free.pop()
             module, fault = named[k]
+            wanted = tests_for(fault, tests_of[module])
+            seconds = clean[module, *wanted]
             try:
-                outcome = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
+                outcome = bench.run(fault, module, wanted, 60 + 4 * sum(seconds.values()), seconds)
             finally:
                 free.append(bench)
             row = row_of(module, fault, outcome)
@@ -605,20 +609,24 @@ def run(
             yield from pool.map(one, range(len(named)))
 
 
-def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, Mapping[str, float]]:
-    """Seconds that each test of every module takes as it is; they must pass."""
+def tests_for(fault: Fault, named: Sequence[str]) -> list[str]:
+    """The tests that are to notice a fault: those named for its module, of a kernel's call those of compiled code."""
+    return COMPILED if fault.function.endswith(KERNELS) else list(named)
+
+
+def _clean(benches: list[Bench], wanted: Sequence[tuple[str, ...]]) -> dict[tuple[str, ...], Mapping[str, float]]:
+    """Seconds that each test of every (module, *tests) takes as it is; they must pass."""
     free = list(benches)
     known: dict[tuple[str, ...], Mapping[str, float]] = {}  # by the tests that are run, the same for any module
 
-    def one(module: str) -> Mapping[str, float]:
-        if module not in tests_of:
-            raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
-        named = tuple(tests_of[module])
+    def one(each: tuple[str, ...]) -> Mapping[str, float]:
+        module, *tests = each
+        named = tuple(tests)
         if named in known and not any("test_contract" in test for test in named):
             return known[named]
         bench = free.pop()
         try:
-            outcome = bench.run(None, module, tests_of[module], 600, {})
+            outcome = bench.run(None, module, tests, 600, {})
             if outcome.failed:
                 raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {outcome.why}")
             known[named] = outcome.seconds

@@ -49,7 +49,7 @@ TESTS: dict[str, list[str]] = {
     "data.codecs.tarballs": ["tests/data/test_ca1m.py"],
     "data.codecs.tfrecord": RLDS,
     "data.codecs.thrift": ["tests/data/test_parquet.py"],
-    "data.codecs.tiff": [*POSED, "tests/data/test_ca1m.py", BOMBS],
+    "data.codecs.tiff": ["tests/data/test_tiff.py", *POSED, "tests/data/test_ca1m.py", BOMBS],
     "data.codecs.video": [*CODECS, *RECORD3D],
     "data.codecs.zips": [BOMBS],
     "data.readers.apc": FOLDERS,
