@@ -574,7 +574,10 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
     columns |= {"xyz": draw.random((n, 3), np.float32), "rgb": draw.integers(0, 256, (n, 3)).astype(np.uint8)}
     codes = ("tracked", "source", "gate", "hole", "candidate", "cause")
     columns |= {name: draw.integers(0, 2, n).astype(np.uint8) for name in codes}
-    clouds = [PointCloud(draw.random((n, 3), np.float32), draw.integers(0, 256, (n, 3)).astype(np.uint8)) for _ in "ab"]
+    clouds = [
+        PointCloud(draw.uniform(-2, 1, (n, 3)).astype(np.float32), draw.integers(0, 256, (n, 3)).astype(np.uint8))
+        for _ in "ab"
+    ]
     swept = SweptPointCloud(
         clouds[0].xyz + 5, clouds[1].rgb, columns["sigma"] + 1, columns["score"], 2.0, columns["cause"]
     )
@@ -614,7 +617,8 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
         else:
             same(packed / 65535 if name == "score" else packed, values.ravel(), 1e-5 if name == "score" else 0)
     for name, cloud in (("seen", clouds[0]), ("held_out", clouds[1]), ("swept", swept)):
-        same(unpack(sent[name]["xyz"]).reshape(-1, 3) * sent[name]["step"] + sent[name]["low"], cloud.xyz, 1e-5)
+        half_step = 0.501 * np.ptp(cloud.xyz, 0).max() / 65535  # 16 bits between the least and the largest coordinate
+        same(unpack(sent[name]["xyz"]).reshape(-1, 3) * sent[name]["step"] + sent[name]["low"], cloud.xyz, half_step)
         same(unpack(sent[name]["rgb"]), cloud.rgb.ravel())
     same(unpack(sent["swept"]["sigma"]), swept.sigma)
     same(unpack(sent["swept"]["score"]) / 65535, swept.score, 1e-5)
