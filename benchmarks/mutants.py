@@ -120,8 +120,8 @@ METHOD = (
 #: pytest's ``-k`` of this run.
 KEYWORD = [""]
 
-#: Functions that hand tensors to compiled code, and the tests that load it; all others are tried without it.
-KERNELS, COMPILED = "_kernel", ["tests/ops/test_compiled.py"]
+#: The tests of every public function in one table, of which a module has its own rows.
+TABLE = "tests/test_contract.py"
 
 #: What the tests of a trial leave in its tree.
 FAILURE, TIMES = "first_failure.txt", "seconds.json"
@@ -556,7 +556,7 @@ class Bench:
         path = modules(self.tree)[module]
         source = path.read_text()
         tests = [t for t in tests if (self.tree / t.split("::")[0]).exists()]
-        table = [t for t in tests if t.endswith("test_contract.py")]  # long to collect, and seldom needed
+        table = [t for t in tests if t == TABLE]  # long to collect, and seldom needed
         outcome = Tried(False)
         try:
             if fault is not None:
@@ -587,15 +587,14 @@ def run(
     warm()
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         benches = [Bench(Path(folder) / str(k), tests) for k in range(jobs)]
-        clean = _clean(benches, sorted({(m, *tests_for(f, tests_of[m])) for m, f in named}))
+        clean = _clean(benches, sorted({m for m, _ in named}), tests_of)
+        whole = {module: sum(of.values()) for module, of in clean.items()}
 
         def one(k: int) -> dict[str, Any]:
             bench = free.pop()
             module, fault = named[k]
-            wanted = tests_for(fault, tests_of[module])
-            seconds = clean[module, *wanted]
             try:
-                outcome = bench.run(fault, module, wanted, 60 + 4 * sum(seconds.values()), seconds)
+                outcome = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
             finally:
                 free.append(bench)
             row = row_of(module, fault, outcome)
@@ -609,33 +608,27 @@ def run(
             yield from pool.map(one, range(len(named)))
 
 
-def tests_for(fault: Fault, named: Sequence[str]) -> list[str]:
-    """The tests that are to notice a fault: those named for its module, of a kernel's call those of compiled code."""
-    return COMPILED if fault.function.endswith(KERNELS) else list(named)
-
-
-def _clean(benches: list[Bench], wanted: Sequence[tuple[str, ...]]) -> dict[tuple[str, ...], Mapping[str, float]]:
-    """Seconds that each test of every (module, *tests) takes as it is; they must pass."""
+def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, Mapping[str, float]]:
+    """Seconds that each test of every module takes as it is; they must pass. A file is run once for all modules."""
     free = list(benches)
-    known: dict[tuple[str, ...], Mapping[str, float]] = {}  # by the tests that are run, the same for any module
+    owner = {(module if test == TABLE else "", test): module for module in wanted for test in tests_of[module]}
 
-    def one(each: tuple[str, ...]) -> Mapping[str, float]:
-        module, *tests = each
-        named = tuple(tests)
-        if named in known and not any("test_contract" in test for test in named):
-            return known[named]
+    def one(key: tuple[str, str]) -> Mapping[str, float]:
         bench = free.pop()
         try:
-            outcome = bench.run(None, module, tests, 600, {})
+            outcome = bench.run(None, owner[key], [key[1]], 600, {})
             if outcome.failed:
-                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {outcome.why}")
-            known[named] = outcome.seconds
+                raise RuntimeError(f"mutants: {key[1]} fails without a fault: {outcome.why}")
             return outcome.seconds
         finally:
             free.append(bench)
 
     with ThreadPoolExecutor(len(benches)) as pool:
-        return dict(zip(wanted, pool.map(one, wanted), strict=True))
+        of = dict(zip(owner, pool.map(one, owner), strict=True))
+    return {
+        module: {k: v for test in tests_of[module] for k, v in of[module if test == TABLE else "", test].items()}
+        for module in wanted
+    }
 
 
 def row_of(module: str, fault: Fault, outcome: Tried) -> dict[str, Any]:

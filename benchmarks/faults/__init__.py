@@ -7,6 +7,7 @@ answer. Rows come from what was once not noticed, and from what the rules of ``m
 from faults import (
     commanding,
     compiled,
+    covering,
     enriching,
     entry,
     front,
@@ -32,5 +33,10 @@ PARTS = (
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
 
-#: Module → the tests of its own that are to notice, quick ones first.
-TESTS: dict[str, list[str]] = {module: tests for part in PARTS for module, tests in part.TESTS.items()}
+_NAMED: dict[str, list[str]] = {module: tests for part in PARTS for module, tests in part.TESTS.items()}
+
+#: Module → the tests that are to notice: its own, then those that run what its own do not run.
+TESTS: dict[str, list[str]] = {
+    module: list(dict.fromkeys([*_NAMED.get(module, []), *covering.TESTS.get(module, [])]))
+    for module in [*_NAMED, *(module for module in covering.TESTS if module not in _NAMED)]
+}

@@ -109,6 +109,7 @@ def test_promises_equal_plain_loops():
             assert row[f"realised_risk_{percent}"] == values[-1]
             above = joined[scene].keep & (joined[scene].score >= (learnt.thresholds[percent] or math.inf))
             assert row[f"coverage_within_{percent}"] == pytest.approx(float(above.double().mean()))
+            assert row[f"n_above_{percent}"] == pytest.approx(int(above.sum()) / len(ours[scene]))
     for name in ("within_sigma", "within_2sigma"):
         wanted = bootstrap.interval_over_scenes([row[name] for row in found.rows], statistic="mean", draws=200, seed=2)
         assert list(found.summary[f"map.{name}"].values())[:3] == list(wanted[:3]), name
