@@ -17,7 +17,6 @@ from dhtorch.experiments.report import cells, curves, layouts, page, plots, publ
 from dhtorch.experiments.report.figure import Figure
 from dhtorch.experiments.report.reading import flatten_row, scene_rows
 from dhtorch.experiments.report.tables import MAIN_COLUMNS, ReportTable, full_tables
-from dhtorch.metrics import risk
 from dhtorch.runtime import results as result_files
 from dhtorch.viz import plots as drawing
 from dhtorch.viz.plots import Axis, Panel, Stroke, colours
@@ -519,17 +518,6 @@ def test_the_console_prints_the_papers_figures_also_for_one_scene(result, one_sc
 
 
 # ---------------------------------------------------------------------------------------------------- the knee
-
-
-def test_the_knee_is_the_point_farthest_below_the_chord():
-    coverage, risks = [0.6, 0.5, 0.35, 0.2, 0.1], [0.13, 0.11, 0.08, 0.075, 0.07]
-    assert risk.find_knee(coverage, risks) == 2
-    assert risk.find_knee([10 * c for c in coverage], [r / 7 + 3 for r in risks]) == 2, "no units"
-    assert risk.find_knee(coverage[::-1], risks[::-1]) == 2, "no order of the points"
-    for straight in ([0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.1, 0.25, 0.3], [0.1, 0.1, 0.1]):
-        assert risk.find_knee([0.1, 0.2, 0.3], straight) is None, straight
-    assert risk.find_knee([0.1, 0.2], [0.1, 0.2]) is None and risk.find_knee([], []) is None
-    assert risk.find_knee([0.2, 0.2, 0.2], [0.1, 0.2, 0.3]) is None, "no width"
 
 
 def test_the_knee_stands_in_the_table_and_in_the_figures():

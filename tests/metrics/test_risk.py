@@ -272,3 +272,14 @@ def test_sparsification_by_hand_and_its_ends():
         )
         is None
     )
+
+
+def test_the_knee_is_the_point_farthest_below_the_chord():
+    coverage, risks = [0.6, 0.5, 0.35, 0.2, 0.1], [0.13, 0.11, 0.08, 0.075, 0.07]
+    assert risk.find_knee(coverage, risks) == 2
+    assert risk.find_knee([10 * c for c in coverage], [r / 7 + 3 for r in risks]) == 2, "no units"
+    assert risk.find_knee(coverage[::-1], risks[::-1]) == 2, "no order of the points"
+    for straight in ([0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.1, 0.25, 0.3], [0.1, 0.1, 0.1]):
+        assert risk.find_knee([0.1, 0.2, 0.3], straight) is None, straight
+    assert risk.find_knee([0.1, 0.2], [0.1, 0.2]) is None and risk.find_knee([], []) is None
+    assert risk.find_knee([0.2, 0.2, 0.2], [0.1, 0.2, 0.3]) is None, "no width"
