@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.source_trees import parsed
 
 import dhtorch
 
@@ -43,7 +44,7 @@ OUTSIDE_OPS = [p for p in FILES if p.relative_to(ROOT).parts[0] != "ops" and re.
 @functools.cache
 def imports(path):
     """Of each import of a file its dotted name, `from a import b` as a.b, and whether it stands within a function."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     found = []
     within = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
     for node in ast.walk(tree):
@@ -164,7 +165,7 @@ def test_help_and_misspelt_options_are_answered_before_torch_is_loaded(words):
 
 
 def test_public_names_are_found_where_they_live():
-    source = ast.parse((ROOT / "__init__.py").read_text())
+    source = parsed(ROOT / "__init__.py")
     (shown,) = (n for n in source.body if isinstance(n, ast.If))
     homes = {alias.name: node.module for node in shown.body for alias in node.names}
     assert sorted(homes) == sorted(dhtorch.__all__) and set(dhtorch.__all__) <= set(dir(dhtorch))
@@ -179,7 +180,7 @@ def test_no_module_shadows_the_standard_library_or_its_own_function():
     for path in FILES:
         if path.stem in ("__init__", "__main__"):
             continue
-        functions = {n.name for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef)}
+        functions = {n.name for n in parsed(path).body if isinstance(n, ast.FunctionDef)}
         exported = {name for name in dir(dhtorch) if not name.startswith("_")}
         assert path.stem not in sys.stdlib_module_names or path.parent != ROOT, path
         assert not (path.stem in functions and path.stem in exported and path.parent == ROOT), path
@@ -221,7 +222,7 @@ def test_compiled_operators_run_through_the_dispatch_alone(path):
     assert {*re.findall(r"\bloader\.(\w+)", path.read_text())} <= {
         "describe_operators"
     } or "dhtorch.ops.loader" not in imported
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     inside, kernels = functions_that_run_operators(tree)
     for name in inside - kernels:
         assert name is not None and callers_of(tree, name), f"{relative}: {name} is no kernel"

@@ -5,6 +5,8 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+from support.source_trees import parsed
+
 import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
@@ -76,7 +78,7 @@ def parts_of(name):
 def test_no_public_name_has_two_meanings():
     homes = defaultdict(set)
     for path in FILES:
-        for name in top_level_names(ast.parse(path.read_text(encoding="utf-8"))):
+        for name in top_level_names(parsed(path)):
             if not name.startswith("_"):
                 homes[name].add(str(path.relative_to(ROOT)))
     several = {name: sorted(at) for name, at in homes.items() if len(at) > 1 and name not in INTERFACES}
@@ -102,7 +104,7 @@ def test_no_identifier_is_a_replaced_word():
     again = {
         (str(path.relative_to(ROOT)), name): REPLACED[part]
         for path in FILES
-        for name in set(identifiers(ast.parse(path.read_text(encoding="utf-8"))))
+        for name in set(identifiers(parsed(path)))
         for part in parts_of(name)
         if part in REPLACED
     }

@@ -4,6 +4,7 @@ import ast
 from pathlib import Path
 
 import pytest
+from support.source_trees import parsed
 
 import dhtorch
 
@@ -42,25 +43,25 @@ def packed(statement):
 
 
 def nodes():
-    """Every node of every file that is checked, with where it stands."""
+    """Every node of every file that is checked, with its file."""
     for file in FILES:
-        for node in ast.walk(ast.parse((ROOT / file).read_text())):
-            yield f"{file}, line {getattr(node, 'lineno', 0)}", node
+        for node in ast.walk(parsed(ROOT / file)):
+            yield file, node
 
 
 def test_a_tuple_assigns_like_things():
     """``a, b = f(x), f(y)`` reads at once; ``a, b = f(x), g(y, z)`` is two statements in one line."""
-    found = [f"{place}: {ast.unparse(node)}" for place, node in nodes() if packed(node)]
+    found = [f"{file}, line {node.lineno}: {ast.unparse(node)}" for file, node in nodes() if packed(node)]
     assert not found, "one statement a line:\n" + "\n".join(found)
 
 
 def test_calls_name_what_they_pass():
     found = []
-    for place, node in nodes():
+    for file, node in nodes():
         if isinstance(node, ast.Call) and len([a for a in node.args if not isinstance(a, ast.Starred)]) > MOST:
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
             if name not in VARIADIC:
-                found.append(f"{place}: {name} is given {len(node.args)} arguments by their place")
+                found.append(f"{file}, line {node.lineno}: {name} is given {len(node.args)} arguments by their place")
     assert not found, "\n".join(found)
 
 

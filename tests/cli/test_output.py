@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.source_trees import parsed
 from support.tiny_runs import ROOM, TINY
 
 import dhtorch
@@ -316,16 +317,14 @@ def test_completion_is_installed_as_the_help_says(command):
 
 
 def nodes(path):
-    return ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return ast.walk(parsed(path))
 
 
 def test_no_module_needs_posix_to_load():
     """Modules and calls that one system lacks stand inside a function, where their absence can be answered."""
     posix = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "posix", "syslog"}
     for path in FILES:
-        top = [
-            n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.Import | ast.ImportFrom)
-        ]
+        top = [n for n in parsed(path).body if isinstance(n, ast.Import | ast.ImportFrom)]
         names = {a.name for n in top if isinstance(n, ast.Import) for a in n.names}
         names |= {str(n.module) for n in top if isinstance(n, ast.ImportFrom)}
         assert not names & posix, path

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from support.source_trees import parsed
 
 from dhtorch.geometry.pyramid import build_pyramid
 
@@ -36,11 +37,6 @@ def sentences(text: str) -> list[str]:
     """Sentences of paragraphs; rows of tables apart."""
     paragraphs = (" ".join(part.split()) for part in re.split(r"\n\s*\n|\n(?=\|)", text))
     return [sentence for part in paragraphs for sentence in re.split(r"(?<=[.:])\s+(?=[A-Z`])", part)]
-
-
-@cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def documented(source: str) -> Iterator[tuple[str, str]]:
