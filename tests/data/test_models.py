@@ -1,12 +1,14 @@
 """Models up to scale: every format is read as it was made, and written in metres with all else unchanged."""
 
+import dataclasses
 import os
 
 import numpy as np
 import pytest
+import torch
 
 from dhtorch.data import FormatError
-from dhtorch.data.models import Similarity, network, read_model, write_model
+from dhtorch.data.models import Similarity, network, read_model, scene_model, write_model
 from tests.support import room_models as made
 
 WRITERS = {
@@ -186,3 +188,139 @@ def test_points_that_are_no_file_are_named(tmp_path, kind):
 def test_no_model_names_the_formats(tmp_path):
     with pytest.raises(FormatError, match="COLMAP"):
         read_model(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------------- points and maps
+
+
+def hidden_by_loops(uv, z, hw, cells=48, nearer=0.05):
+    """Which points are inside and not behind another one in their cell, point by point."""
+    side = max(hw) / cells
+    inside = [
+        d > 0 and 0 <= u <= hw[1] - 1 and 0 <= v <= hw[0] - 1 for (u, v), d in zip(uv.tolist(), z.tolist(), strict=True)
+    ]
+    nearest = {}
+    for (u, v), d, use in zip(uv.tolist(), z.tolist(), inside, strict=True):
+        if use:
+            cell = (int(u / side), int(v / side))
+            nearest[cell] = min(d, nearest.get(cell, d))
+    return [
+        use and d <= (1 + nearer) * nearest[int(u / side), int(v / side)]
+        for (u, v), d, use in zip(uv.tolist(), z.tolist(), inside, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("hw", [(96, 192), (192, 96)])
+def test_a_point_is_seen_where_none_is_nearer_in_its_cell(hw):
+    draw = np.random.default_rng(3)
+    uv = torch.from_numpy(draw.uniform(-10, 200, (3000, 2)))
+    z = torch.from_numpy(np.where(draw.random(3000) < 0.1, -1.0, draw.uniform(1, 1.3, 3000)))
+    uv[:4] = torch.tensor([[0.0, 0.0], [hw[1] - 1, hw[0] - 1], [hw[1] - 0.9, 3], [3, hw[0] - 0.9]])
+    z[:4] = 0.5
+    seen = scene_model._unoccluded(uv, z, hw)
+    assert seen.tolist() == hidden_by_loops(uv, z, hw) and 20 < int(seen.sum()) < 1500
+    assert seen[:4].tolist() == [True, True, False, False], "pixels of the picture, and beyond"
+    assert scene_model._unoccluded(uv[:0], z[:0], hw).tolist() == []
+
+
+def test_points_of_a_view_without_observations_are_projected_through_its_lens():
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # looks along the world's x
+    T[:3, 3] = 1, 2, 3
+    local = np.array([[0.2, -0.1, 2.0], [0.24, -0.12, 2.4], [0.0, 0.0, -1.0], [-0.5, 0.3, 4.0], [9.0, 0.0, 1.0]])
+    K = np.array([[50.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    lens = (0.1, 0.01, 0.0, 0.0, 0.0)
+    view = scene_model.ModelView("a", K, (48, 64), T, distortion=lens)
+    uv, z = scene_model.SceneModel([view], view.to_world(local)).seen_points(view)
+    shown = local[[0, 3]]  # one is hidden, one behind the camera, one beside the picture
+    np.testing.assert_allclose(z, shown[:, 2], rtol=1e-12)
+    x = shown[:, :2] / shown[:, 2:]
+    r2 = (x**2).sum(1, keepdims=True)
+    np.testing.assert_allclose(uv, x * (1 + lens[0] * r2 + lens[1] * r2**2) * [50, 60] + [32, 24], atol=1e-9)
+    observed = dataclasses.replace(view, point=np.array([3, 2, 0]), uv=np.array([[1.0, 2], [3, 4], [5, 6]]))
+    uv, z = scene_model.SceneModel([observed], view.to_world(local)).seen_points(observed)
+    assert uv.tolist() == [[1, 2], [5, 6]] and z.tolist() == pytest.approx([4, 2]), "as stored, in front of the camera"
+
+
+def arrays_of(n=3, hw=(4, 5), **changes):
+    """Arrays of a network with n views, every number its own, and the depth of its maps."""
+    draw = np.random.default_rng(0)
+    depth = draw.uniform(1, 3, (n, *hw))
+    depth[:, 0, 0] = 0, np.nan, -1
+    c2w = np.tile(np.eye(4), (n, 1, 1))
+    c2w[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    c2w[:, :3, 3] = draw.random((n, 3))
+    K = np.tile(np.diag([7.0, 8.0, 1.0]), (n, 1, 1))
+    K[:, 0, 0] += np.arange(n)
+    return {"depth": depth, "c2w": c2w, "K": K} | changes, np.where(depth > 0, depth, 0)
+
+
+@pytest.mark.parametrize("poses", ["c2w", "w2c", "w2c of three rows"])
+@pytest.mark.parametrize("maps", ["depth", "depth of one channel", "points"])
+def test_maps_of_a_network_are_read_for_every_view(tmp_path, poses, maps):
+    values, depth = arrays_of()
+    c2w = values["c2w"]
+    if poses != "c2w":
+        w2c = np.linalg.inv(values.pop("c2w"))
+        values["w2c"] = w2c[:, :3] if "three" in poses else w2c
+    if maps == "points":
+        v, u = np.mgrid[:4, :5]
+        f = np.stack((values["K"][:, 0, 0], values["K"][:, 1, 1]), -1)[:, None, None]
+        stored = values.pop("depth")[..., None]
+        local = np.concatenate((np.stack((u, v), -1) / f * stored, stored), -1)
+        values["points"] = np.einsum("nij,nhwj->nhwi", c2w[:, :3, :3], local) + c2w[:, None, None, :3, 3]
+    elif "channel" in maps:
+        values["depth"] = values["depth"][..., None]
+    views = list(network._views_of_arrays(tmp_path / "a.npz", values, ["x/one.png", "two", "three"]))
+    assert [view.name for view in views] == ["one.png", "two", "three"] and all(v.hw == (4, 5) for v in views)
+    for k, view in enumerate(views):
+        np.testing.assert_allclose(view.depth, depth[k], atol=1e-12)
+        np.testing.assert_allclose(view.c2w, c2w[k], atol=1e-12)
+        np.testing.assert_allclose(view.K, values["K"][k])
+
+
+def test_the_least_confident_quarter_is_left_out_and_one_camera_serves_all_views(tmp_path):
+    values, depth = arrays_of(conf=np.tile(np.arange(20.0).reshape(4, 5), (3, 1, 1)))
+    values["K"] = values["K"][1]
+    views = list(network._views_of_arrays(tmp_path / "a.npz", values, None))
+    assert [view.name for view in views] == ["000000", "000001", "000002"]
+    for k, view in enumerate(views):
+        np.testing.assert_array_equal(view.depth, np.where(np.arange(20).reshape(4, 5) < 5, 0, depth[k]))
+        np.testing.assert_array_equal(view.K, values["K"])
+
+
+def test_arrays_without_an_axis_of_views_are_one_view(tmp_path):
+    values, depth = arrays_of()
+    (view,) = network._views_of_arrays(tmp_path / "a.npz", {name: each[2] for name, each in values.items()}, None)
+    np.testing.assert_array_equal(view.depth, depth[2])
+    np.testing.assert_array_equal(view.c2w, values["c2w"][2])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"c2w": np.eye(4)[0]}, r"pose: found shape \(4,\)"),
+        ({"K": np.zeros((0, 3, 3))}, r"K: found shape \(0, 3, 3\)"),
+        ({"conf": np.ones((2, 4, 5))}, "shapes: found .* expected the same number of views in all arrays, here 3"),
+        ({"depth": np.ones((3, 4, 5, 2))}, "shapes: found "),
+        ({"c2w": None, "w2c": np.zeros((3, 4, 4))}, "poses: found a singular matrix"),
+    ],
+)
+def test_arrays_of_another_shape_are_named(tmp_path, changes, words):
+    values, _ = arrays_of(**changes)
+    with pytest.raises(FormatError, match=words):
+        list(network._views_of_arrays(tmp_path / "a.npz", {k: v for k, v in values.items() if v is not None}, None))
+
+
+def test_names_are_stored_or_those_of_the_archive_or_of_the_pictures(tmp_path):
+    root, archive = tmp_path / "model", tmp_path / "model" / "a.npz"
+    (root / "images").mkdir(parents=True)
+    np.savez(archive, image_paths=np.array([["p/1.png", "p/2.png"]]))
+    find = network._names_of_arrays
+    assert find(root, archive, {"K", "image_paths"}, 1, None) == ["p/1.png", "p/2.png"]
+    assert find(root, archive, {"K"}, 2, None) == ["a"] and find(root, archive, {"K"}, 1, None) is None
+    for name in ("10.png", "9.png", "notes.txt"):
+        (root / "images" / name).touch()
+    pictures = [root / "images" / name for name in ("9.png", "10.png")]
+    assert find(root, archive, {"K"}, 1, None) == find(archive, archive, {"K"}, 1, None) == pictures
+    assert find(root, archive, {"K"}, 1, root) is None, "another folder, which has none"

@@ -22,7 +22,7 @@ from dhtorch import data
 from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import rh20t, rh20t_robot
+from dhtorch.data.readers import rh20t, rh20t_robot, rh20t_set
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS, RobotStream
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
@@ -332,3 +332,49 @@ def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):
     np.save(file, np.zeros((5000, 5000), np.uint8))
     with pytest.raises(FormatError, match=r"tcp: found an array of shape \(5000, 5000\), expected 7 finite numbers"):
         rh20t_robot.read_calibration_tcp(file, rh20t_robot.RobotArm("ur5", (), *[np.eye(4)] * 3))
+
+
+# ------------------------------------------------------------------------------------------------------ folders of a set
+
+
+def robot_folder(root: Path, name: str, *cameras: str, calib: int | str = 1234) -> Path:
+    """A scene with the (empty) videos of some cameras."""
+    for serial in cameras:
+        (root / name / f"cam_{serial}").mkdir(parents=True)
+        (root / name / f"cam_{serial}" / "color.mp4").touch()
+    (root / name).mkdir(parents=True, exist_ok=True)
+    (root / name / "metadata.json").write_text(json.dumps({"calib": calib}))
+    return root / name
+
+
+def test_a_set_is_its_calibrated_robot_scenes_with_the_camera_in_the_order_of_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, other = ROBOT_ARMS[1].in_hand[0], "750612070851"
+    later = robot_folder(tmp_path, "task_0002_user_0001_scene_0001_cfg_0001", hand, other)
+    first = robot_folder(tmp_path / "RH20T_cfg1", "task_0001_user_0001_scene_0003_cfg_0001", hand)
+    third = robot_folder(tmp_path, "task_0003_user_0001_scene_0001_cfg_0005", ROBOT_ARMS[5].in_hand[1])
+    robot_folder(tmp_path, "task_0001_user_0001_scene_0001_cfg_0001_human", hand)
+    robot_folder(tmp_path, "task_0001_user_0001_scene_0001_cfg_0008", hand)
+    robot_folder(tmp_path, "task_0004_user_0001_scene_0001_cfg_0001", other)
+    robot_folder(tmp_path, "task_0005_user_0001_scene_0001_cfg_0001", hand, calib=-1)
+    robot_folder(tmp_path, "task_0006_user_0001_scene_0001_cfg_0001", hand, calib="-1")
+    (robot_folder(tmp_path, "task_0007_user_0001_scene_0001_cfg_0001", hand) / "metadata.json").unlink()
+    calls: list[dict[str, object]] = []
+    monkeypatch.setattr(rh20t, "read", lambda scene, **options: [(scene, calls.append(options))])
+    found = rh20t_set.open_set(tmp_path)
+    assert found.names == [
+        f"{f.name}/{s}" for f, s in ((first, hand), (later, hand), (third, ROBOT_ARMS[5].in_hand[1]))
+    ]
+    assert [found[k][0] for k in range(3)] == [first, later, third]
+    defaults = {"max_difference": 0.02, "max_gap": 0.5, "outlier": 0.0}
+    assert calls[1] == {"serials": [hand], "depth_root": None, **defaults}
+    options = {"max_difference": 0.1, "max_gap": 0.2, "outlier": 3.0}
+    found = rh20t_set.open_set(tmp_path, camera=other, depth_root="depths", **options)
+    assert found.names == [f"{f.name}/{other}" for f in (later, tmp_path / "task_0004_user_0001_scene_0001_cfg_0001")]
+    assert found[0][0] == later and calls[-1] == {"serials": [other], "depth_root": f"depths/{later.name}", **options}
+    assert rh20t_set.open_set(tmp_path, limit=1).names == [f"{first.name}/{hand}"]
+    with pytest.raises(FormatError, match=r"scenes: found none, expected task_…_cfg_… folders .* camera 'nobody'"):
+        rh20t_set.open_set(tmp_path, camera="nobody")
+    with pytest.raises(FormatError, match="path: found no such folder"):
+        rh20t_set.open_set(tmp_path / "nowhere")
