@@ -507,6 +507,8 @@ def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: 
         os.waitpid(child, 0)
         return Tried(True, f"did not end in {limit_s:.0f} s")
     code = os.waitstatus_to_exitcode(status)
+    if code < 0 and not failure.exists():
+        return Tried(True, f"ended by {signal.Signals(-code).name}")
     if code not in (0, 1, NONE) and not failure.exists():
         raise RuntimeError(
             f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
