@@ -471,7 +471,7 @@ def _plot_depths(axes: Any, survey: Survey) -> None:
     counts, edges = np.histogram(survey.depths.numpy(), bins=90, range=(0, 1.1 * high))
     middle = (edges[1:] + edges[:-1]) / 2
     axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[DEPTH_CMAP]((middle - low) / (high - low)))
-    axes.set_xlabel("depth, m, in the colours of the maps above (white: no return)", fontsize=7)
+    axes.set_xlabel("depth, m, coloured as above (white: no return)", fontsize=7)
     axes.set_yticks([])
     axes.tick_params(labelsize=6)
 
