@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from support.sample_dicts import SIDE, frames
 from torch.utils.data import DataLoader
 
 from dhtorch import testing as writers
-from dhtorch.cli import run
+from dhtorch.cli import run, validate
 from dhtorch.cli.validate import (
     _deviation_lower_bound,
     _drift_lower_bound,
@@ -160,8 +161,93 @@ def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     unnamed = _format_summary("room", found["whole"] | {"causes": {}})
     assert unnamed[-1] == "  cut at 2.55 m: larger depths are set to this value"
     assert not any("farther" in line for line in _format_summary("room", found["whole"])), "said once"
-    assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": None}]) is None, "not most of them"
-    assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": 3.0}]) is None, "not at one depth"
+
+
+def test_the_depth_at_which_most_maps_end_is_that_of_the_recording():
+    def shared(*depths):
+        return _find_shared_clip_depth([{"clip_depth": depth} for depth in depths])
+
+    assert shared(2.55, 2.56, None) == pytest.approx(2.555) and shared(3.0, 2.0, 2.0, 2.01) == pytest.approx(2.005)
+    assert shared(2.55, None) is None and shared() is None, "not most of them"
+    assert shared(2.55, 3.0) is None and shared(2.0, 2.03, 2.06) is None, "not at one depth"
+
+
+class Windows:
+    """A recording of frames numbered from 20 whose diagnosis and rows are made up."""
+
+    def __init__(self, monkeypatch, n, maps=None, cause="", clips=()):
+        self.scene = SimpleNamespace(name="hall", recording=Numbered(range(20, 20 + n)), role=None, hint=None)
+        self.validated = validate.RecordingValidation(self.scene, maps)
+        self.diagnosed, self.clips, self.cause = [], dict(clips), cause
+        monkeypatch.setattr(validate, "_load_frame", lambda scene, settings, i: f"frame {i}")
+        monkeypatch.setattr(validate, "_validate_frame", lambda validated, frame, i, method, settings: frame)
+        monkeypatch.setattr(validate, "_summarise_frame", lambda number, found: self.row(number))
+        monkeypatch.setattr(validate, "_keep_worst", lambda *_: None)
+        monkeypatch.setattr(validate.faults, "diagnose", self.diagnose)
+
+    def row(self, number):
+        return {"frame": number, "clip_depth": self.clips.get(number)}
+
+    def diagnose(self, frames, maps=None, seed=None):
+        self.diagnosed.append((frames, maps, seed))
+        return validate.faults.Diagnosis(self.cause or None, "unit" if self.cause else None, {"unit": 0.5}, 3, "tracks")
+
+    def windows(self, **settings):
+        options = {"every": 1, "max_frames": None, "window": 4, "seed": 5} | settings
+        progress = lambda items, text, n: self.texts.append((text, n)) or items  # noqa: E731
+        self.texts = []
+        return validate._validate_recording(self.validated, None, options, progress).windows
+
+
+class Numbered(list):
+    """Frames with numbers."""
+
+    @property
+    def number(self):
+        return torch.tensor(list(self))
+
+
+def test_windows_cover_the_validated_frames_and_are_of_one_size(monkeypatch):
+    made = Windows(monkeypatch, 10, cause="millimetres")
+    rows = made.windows()
+    assert [row["frames"] for row in rows] == [[20, 23], [24, 27]], "a rest that is shorter has none"
+    assert made.diagnosed[1] == ([f"frame {k}" for k in range(4, 8)], None, 5)
+    assert rows[0] == {
+        **{"frames": [20, 23], "pairs": 3, "by": "tracks"},
+        **{"cause": "millimetres", "kind": "unit", "loss": {"unit": 0.5}},
+    }
+    assert [row["frame"] for row in made.validated.rows] == list(range(20, 30))
+    assert made.texts == [("hall: frames", 10), ("hall: windows", 2)]
+    assert [row["frames"] for row in Windows(monkeypatch, 10).windows(max_frames=6)] == [[20, 23]]
+    assert [row["frames"] for row in Windows(monkeypatch, 10).windows(every=3)] == [[20, 23], [24, 27]]
+    assert [row["frames"] for row in Windows(monkeypatch, 3).windows()] == [[20, 22]], "fewer frames than a window"
+    assert Windows(monkeypatch, 1).windows() == [] and Windows(monkeypatch, 10).windows(window=0) == []
+
+
+def test_a_window_without_a_cause_is_cut_where_its_maps_end(monkeypatch):
+    clips = {20: 2.5, 21: 2.5, 22: 2.51, 24: 2.5}
+    first, second = Windows(monkeypatch, 8, clips=clips).windows()
+    assert (first["cause"], first["kind"], first["loss"]) == ("cut at 2.5 m", "cut", {"unit": 0.5})
+    assert (second["cause"], second["kind"]) == (None, None)
+    (named, _) = Windows(monkeypatch, 8, clips=clips, cause="millimetres").windows()
+    assert (named["cause"], named["kind"]) == ("millimetres", "unit"), "a cause that is named comes first"
+
+
+def test_maps_of_a_window_have_one_size_or_no_diagnosis(monkeypatch):
+    class Maps(list):
+        frames = [0, 1, 2, 3]  # noqa: RUF012
+        doubts = notes = ()
+
+    maps = Maps([torch.ones(1, 2, 3), None, torch.full((1, 2, 3), 2.0), None])
+    made = Windows(monkeypatch, 4, maps, cause="millimetres")
+    (row,) = made.windows()
+    ((frames, given, _),) = made.diagnosed
+    assert row["cause"] == "millimetres" and frames == [f"frame {k}" for k in range(4)]
+    assert [float(each.mean()) for each in given] == [1, 0, 2, 0] and {each.shape for each in given} == {(1, 2, 3)}
+    for other in (Maps([torch.ones(1, 2, 3), torch.ones(1, 4, 6), None, None]), Maps([None] * 4)):
+        made = Windows(monkeypatch, 4, other, cause="millimetres")
+        (row,) = made.windows()
+        assert made.diagnosed == [] and (row["pairs"], row["cause"], row["loss"]) == (0, None, {})
 
 
 def test_a_guessed_field_of_view_is_told(tmp_path, room):
