@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from PIL import Image
 
 from dhtorch.data.recording import Recording
+from dhtorch.export.colmap import ColmapImage
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import colmap_model
@@ -92,3 +94,44 @@ def test_pictures_are_undistorted_as_opencv_does_and_have_no_empty_pixels() -> N
     assert pinhole.distortion is None and not np.allclose(K, K_new)
     other = cv2.remap(image[0].movedim(0, -1).numpy(), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     assert np.abs(picture.astype(int) - other.astype(int)).max() <= 5, "weights of 1/32 px in OpenCV, exact ones here"
+
+
+@pytest.mark.parametrize("n_depths", [24, 9000])
+@pytest.mark.parametrize("kind", ["uint8", "grey, floating point"])
+def test_swept_pixels_are_points_seen_in_their_picture(n_depths: int, kind: str) -> None:
+    hw, map_hw = ((48, 64), (6, 8)) if n_depths == 24 else ((480, 640), (96, 128))
+    generator = torch.Generator().manual_seed(1)
+    image = torch.randint(0, 256, (1, 3, *hw), generator=generator, dtype=torch.uint8)
+    image = image[:, :1] / 255 if kind != "uint8" else image
+    camera = Camera(torch.full((1, 2), 60.0), torch.tensor([[30.0, 25.0]]))
+    frame = Frame(image, torch.zeros(1, *hw), camera)
+    depth = torch.zeros(1, *map_hw)
+    depth.view(-1)[torch.randperm(depth.numel(), generator=generator)[:n_depths]] = 2.0
+    depth = depth * torch.linspace(1, 2, map_hw[1])
+    turn = se3.exp(torch.tensor([[0.1, 0.3, -0.2, 1.0, 2.0, 3.0]], dtype=torch.float64))
+    shifted = camera.replace(c=camera.c + 1.0)  # of the written picture, which shows less at the left
+    shots = [None, ColmapImage("a.png", shifted, hw, turn)]
+    answer = SimpleNamespace(
+        pair=(7, 9),
+        camera=camera,
+        rgb=torch.zeros(1, 5, 3),
+        swept=SimpleNamespace(hw=map_hw, read=lambda: (depth, depth, depth)),
+    )
+    points = colmap_model._swept_points(answer, frame, shots, {7: 1})
+    step = max(1, -(-n_depths // 4000))
+    chosen = [k for k, z in enumerate(depth.flatten().tolist()) if z > 0][::step]
+    rows, columns = np.divmod(chosen, map_hw[1])
+    scale = hw[0] / map_hw[0]
+    uv = np.stack(((columns + 0.5) * scale - 0.5, (rows + 0.5) * scale - 0.5), 1)
+    moved = uv + 1
+    inside = ((moved > -0.5) & (moved < np.array(hw[::-1]) - 0.5)).all(1)
+    z = depth.flatten()[chosen].numpy()
+    local = np.concatenate(((uv - [30, 25]) / 60 * z[:, None], z[:, None]), 1)
+    world = local @ turn.R[0].numpy().T + turn.t[0].numpy()
+    np.testing.assert_allclose(points.xyz, world[inside], atol=1e-5)
+    np.testing.assert_allclose(points.uv[:, 0], moved[inside], atol=1e-4)
+    assert bool(points.uv[:, 1].isnan().all()) and (points.error == -1).all()
+    assert points.seen_by.tolist() == [[1, -1]] * int(inside.sum())
+    nearest = np.floor(uv + 0.5).astype(int)[inside]
+    pixels = image[0].expand(3, *hw)[:, nearest[:, 1], nearest[:, 0]].T
+    np.testing.assert_allclose(points.rgb, pixels / 255 if kind == "uint8" else pixels, atol=1e-6)
