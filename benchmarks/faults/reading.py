@@ -84,7 +84,7 @@ TESTS: dict[str, list[str]] = {
     "data.readers.rosbag": BAG,
     "data.readers.rosbag_cameras": BAG,
     "data.readers.rosbag_index": BAG,
-    "data.readers.rosbag_transforms": BAG,
+    "data.readers.rosbag_transforms": ["tests/data/test_rosbag_transforms.py", *BAG],
     "data.readers.scannet": FOLDERS,
     "data.readers.sens_folder": FOLDERS,
     "data.readers.simulator_hdf5": HDF5,

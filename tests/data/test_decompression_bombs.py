@@ -252,3 +252,14 @@ def test_links_that_leave_a_capture_are_refused_unless_asked_for(tmp_path: Path)
     entry = tmp_path / "entry"
     entry.symlink_to(outside)
     assert data.open(entry)[0].image.numel(), "the capture itself may lie behind a link"
+
+
+def test_a_text_counts_two_bytes_a_letter_and_five_a_byte_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[tuple[str, int]] = []
+    monkeypatch.setattr(files, "check_memory", lambda file, field, takes, *_: counted.append((field, takes)))
+    for name, text in (("a.txt", "plain text"), ("b.txt", "\N{GRINNING FACE}")):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        assert files.read_text(tmp_path / name) == text
+    assert counted == [("text", 2 * 10), ("text", 5 * 4)]
