@@ -243,6 +243,7 @@ def test_deletions_and_additions_of_hydra_are_no_paths(words):
     assert run._name_positionals("run", ["~/room.r3d", *words]) == ["data=auto", "data.root='~/room.r3d'", *words]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "job"], ["--info", "defaults-tree"]])
 def test_hydra_s_own_flags_go_with_deletions(command, flags):
     argv = ["experiment=method_comparison", "~method@experiment.methods.kornia", *flags, "experiment.seeds=1"]

@@ -352,6 +352,7 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     assert all((decode_map(row, DEPTH) > 0).any() for row in found)
 
 
+@pytest.mark.slow
 def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):
     """As a full disk or a kill leaves the folder: no file, or half of the first."""
     out = tmp_path / "set"

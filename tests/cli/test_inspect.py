@@ -120,7 +120,17 @@ BELOW = {n: ("", "one", "one/two")[k % 3] for k, n in enumerate(WRITTEN)} | {"ca
 
 
 #: Further layouts of formats of which one is among the others, and formats whose reader has tests of the same capture.
-SLOW = ("driving", "stray_depth_only", "record3d_exr", "record3d_mp4", "arkitscenes", "ca1m", "fod500")
+SLOW = (
+    "driving",
+    "stray",
+    "stray_depth_only",
+    "record3d_exr",
+    "record3d_mp4",
+    "arkitscenes",
+    "ca1m",
+    "fod500",
+    "counted",
+)
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,7 @@ def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):
     assert code == 2 and "did you mean register?" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "methods"),
     [

@@ -214,6 +214,7 @@ def test_exit_codes_stand_in_every_help(command):
         assert "Exit code: 0 done, 2 bad option or bad data, 130 interrupted" in out, word
 
 
+@pytest.mark.slow
 def test_exit_codes(command):
     assert command(*TINY, "output=fine")[0] == 0
     assert command("report", "fine")[0] == 0

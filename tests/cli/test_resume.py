@@ -223,6 +223,7 @@ def test_a_missing_launcher_names_the_extra(command):
     assert code == 2 and "dhtorch[scale]" in err and len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.text(min_size=1), min_size=2, max_size=2, unique=True))
 def test_names_of_jobs_are_safe_short_and_different(texts):

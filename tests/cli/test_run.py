@@ -54,6 +54,7 @@ def results(folder):
     return sorted(folder.rglob("result.json"))
 
 
+@pytest.mark.slow
 def test_one_job_writes_one_result_and_its_pictures(job):
     folder, done = job
     (path,) = results(folder)
@@ -156,6 +157,7 @@ def test_a_broken_file_is_one_line_from_a_worker_too(command, tmp_path, workers)
     assert "00001.png" in err and "Traceback" not in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", [["pairs=time", "pairs.seconds=0.06"], ["pairs=baseline", "pairs.metres=0.04"]])
 def test_pairs_by_time_and_by_baseline(command, tmp_path, pairs):
     code, _, err = command(*[o for o in TINY if not o.startswith("pairs")], *pairs, "figures=false")

@@ -202,6 +202,7 @@ def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
         video.read_video_header(file)
 
 
+@pytest.mark.slow
 def test_honest_files_stay_within_the_law(tmp_path: Path) -> None:
     """What is large because it holds much is still read: long texts, many scans of a small picture, plain arrays."""
     (tmp_path / "x.txt").write_text("1.0 2.0 3.0 4.0\n" * 100_000)

@@ -108,6 +108,7 @@ def test_pairs_with_few_candidates_are_dropped_and_counted():
     assert row["n_few"] == 2 and row["n_pairs"] == 0 and "median_rel" not in row
 
 
+@pytest.mark.slow
 def test_a_rotation_scene_never_enters_the_summary():
     rotation = small(path="rotation", lidar="exact")
     outcome = pair.run([room_scene(rotation)], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())

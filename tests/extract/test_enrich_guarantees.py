@@ -118,6 +118,7 @@ def test_killed_at_any_moment_or_out_of_disk_it_ends_with_the_same_bytes(moments
     assert not left, "locks and unfinished files are gone"
 
 
+@pytest.mark.slow
 def test_workers_give_the_same_bytes(robot, whole, tmp_path):
     assert read_files(enrich(robot, tmp_path / "set", "workers=2")) == read_files(whole)
 
@@ -658,15 +659,19 @@ def test_links_that_leave_a_data_set_are_not_read(robot, tmp_path, name):
     ("format", "content"),
     [
         ("lerobot", "null"),
-        ("lerobot", '{"key": null, "config": 3}'),
-        ("nerfstudio", ""),
         ("nerfstudio", '{"key": 1}'),
         *(
             pytest.param(*each, marks=pytest.mark.slow)
             for each in itertools.product(("lerobot", "nerfstudio"), ("[]", "7", '"x"', "{}"))
         ),
-        *(pytest.param("lerobot", content, marks=pytest.mark.slow) for content in ("", '{"key": 1}')),
-        *(pytest.param("nerfstudio", text, marks=pytest.mark.slow) for text in ("null", '{"key": null, "config": 3}')),
+        *(
+            pytest.param("lerobot", text, marks=pytest.mark.slow)
+            for text in ("", '{"key": 1}', '{"key": null, "config": 3}')
+        ),
+        *(
+            pytest.param("nerfstudio", text, marks=pytest.mark.slow)
+            for text in ("", "null", '{"key": null, "config": 3}')
+        ),
     ],
 )
 def test_metadata_of_other_types_are_no_folder_of_enrich(robot, tmp_path, capsys, content, format):
@@ -679,7 +684,7 @@ def test_metadata_of_other_types_are_no_folder_of_enrich(robot, tmp_path, capsys
     assert [*read_files(out)] == ["meta/dhtorch.json"], "nothing is written"
 
 
-@pytest.mark.parametrize("linked", [0, 1])
+@pytest.mark.parametrize("linked", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_pictures_named_by_cells_are_not_read_through_links(robot, tmp_path, capsys, linked):
     """A mask in files beside the tables, of which one is a link to a file outside."""
     source, outside = tmp_path / "source", tmp_path / "secret.png"

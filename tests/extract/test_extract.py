@@ -114,6 +114,7 @@ def live(root, **options):
     return ExtendedDataset(Items(root), ExtendDepth(method=method, n=N, **views, **options), gap=GAP)
 
 
+@pytest.mark.slow
 def test_a_gap_of_zero_reads_no_second_view(robot, command):
     code, out, err = command(*asked(robot, "extract.columns=[depth]", gap=0))
     assert code == 0 and err == "" and "12 no second view" in out
@@ -277,6 +278,7 @@ def test_a_corrupt_frame_raises_in_one_line(damaged, command):
     assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]
 
 
+@pytest.mark.slow
 def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
     code, out, err = command(*damaged, "extract.on_error=skip")
     assert code == 0 and not without_notes(err), err
@@ -320,6 +322,7 @@ def test_bad_input_gets_one_clear_line(command, args, words):
     assert not files("x")
 
 
+@pytest.mark.slow
 def test_a_recording_without_a_gap_asks_for_one(robot, command):
     code, _, err = command("data=lerobot", f"data.root={robot}", "extract.gap=null", "out=x", *PAPER)
     assert code == 2 and "extract.gap" in err and "0 = front end only" in err
@@ -332,6 +335,7 @@ def test_a_folder_that_cannot_be_written(robot, command):
     assert code == 2 and "Permission denied" in err and "features" in err
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(robot, command, monkeypatch):
     real = columns.arrow_table
 

@@ -53,6 +53,7 @@ def test_held_out_frames_are_neither_labelled_nor_source_views(study):
             assert views and set(views) <= set(training) - {i}
 
 
+@pytest.mark.slow
 def test_labels_hold_near_returns_and_far_answers_and_no_hidden_return(study, labelled):
     lessons, tests = (collate(part) for part in labelled)
     near, sensed = study.scenes[0].near, (lessons.depth > 0) & ~lessons.recovered

@@ -47,6 +47,7 @@ def found():
     return collate(pinned().check(room()[k].image) for k in range(4))
 
 
+@pytest.mark.slow
 def test_offsets_are_right_to_three_sigma():
     result = found()
     assert bool(result.metric.all()) and result.reason.tolist() == [PinReason.ANSWERED] * 4

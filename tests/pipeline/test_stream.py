@@ -53,6 +53,7 @@ def test_the_newest_frame_is_answered_from_those_before_it(frames: list[Frame]) 
     assert stream.pushed == 5 and stream.cuts == []
 
 
+@pytest.mark.slow
 def test_memory_is_the_last_frames_and_no_more(frames: list[Frame]) -> None:
     stream = Stream(PAPER.replace(n=32), steps=(1, 3))
     sizes = []

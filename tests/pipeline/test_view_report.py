@@ -38,6 +38,7 @@ def outcome(room):
     return pair.run([room_scene(room)], SMALL, OFFERED, protocol.Settings(cutoff=math.inf))
 
 
+@pytest.mark.slow
 def test_every_method_chooses_among_what_is_offered(outcome):
     offered = {0: {1, 2, 4}, 3: {1, 2, 4}}
     rows = [r for r in outcome.rows if r["pair"] is not None]

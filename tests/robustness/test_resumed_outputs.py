@@ -173,6 +173,7 @@ def test_an_empty_or_shortened_output_counts_as_missing(
         }
 
 
+@pytest.mark.slow
 def test_unfinished_files_of_a_dead_run_are_removed(robot: Path, tmp_path: Path) -> None:
     out = tmp_path / "set"
     words = [*_lerobot(robot, robot)]

@@ -361,6 +361,7 @@ def tensor(image):
     return torch.from_numpy(image)[None, None]
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 def test_real_pairs_agree_with_opencv():

@@ -280,7 +280,7 @@ def test_wrong_arguments():
 
 
 @pytest.mark.parametrize("register", [True, False])
-@pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_kornia])
+@pytest.mark.parametrize("track", [lucas_kanade, pytest.param(lucas_kanade_kornia, marks=pytest.mark.slow)])
 def test_gradient_is_that_of_the_tracker(track, register):
     images, uv = sequence(4), points(12)
     plain = through(images, uv, track, register=register, levels=2)

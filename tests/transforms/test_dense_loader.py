@@ -240,6 +240,7 @@ def bytes_of(folder):
     return {p.name: p.read_bytes() for p in sorted(folder.glob("*.parquet"))}
 
 
+@pytest.mark.slow
 def test_maps_are_written_read_back_and_resumed(command, tmp_path):
     code, said, err = command("extract.half=true")
     assert code == 0 and "2 shards, 3 rows" in said, err

@@ -339,7 +339,7 @@ def in_process(items):
     [
         (0, None, 5, {}),
         (2, "fork", 2, {"persistent_workers": True, "pin_memory": True}),
-        (1, "spawn", 3, {}),
+        pytest.param(1, "spawn", 3, {}, marks=pytest.mark.slow),
     ],
 )
 def test_workers_and_batch_size_change_nothing(items, in_process, workers, context, batch, options):

@@ -78,8 +78,7 @@ def test_a_stated_unit_is_not_announced(frames):
     [
         "wxyz",
         "mm",
-        *(pytest.param(c, marks=pytest.mark.slow) for c in ("world_to_camera", "opengl")),
-        "world_to_camera+opengl",
+        *(pytest.param(c, marks=pytest.mark.slow) for c in ("world_to_camera", "opengl", "world_to_camera+opengl")),
     ],
 )
 def test_refuted_poses_are_named_and_removed(convention, frames, true):
@@ -97,7 +96,9 @@ def test_refuted_poses_are_named_and_removed(convention, frames, true):
     assert check.lines[-1].endswith(f"(remedy: data.pose_convention={convention})")
 
 
-@pytest.mark.parametrize(("lag", "has_poses"), [pytest.param(1, True, marks=pytest.mark.slow), (3, False), (-2, True)])
+@pytest.mark.parametrize(
+    ("lag", "has_poses"), [*(pytest.param(lag, True, marks=pytest.mark.slow) for lag in (1, -2)), (3, False)]
+)
 def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
     inside = [k for k in range(N) if 0 <= k - lag < N]
     late = [frames[k].replace(depth=frames[k - lag].depth) for k in inside]
@@ -112,7 +113,9 @@ def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
     assert not check_capture(corrected).findings
 
 
-@pytest.mark.parametrize("turn", ["left_right", pytest.param("upside_down", marks=pytest.mark.slow), "180"])
+@pytest.mark.parametrize(
+    "turn", ["left_right", *(pytest.param(turn, marks=pytest.mark.slow) for turn in ("upside_down", "180"))]
+)
 def test_turned_depth_is_named_with_its_turn(turn, frames, true):
     flip = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[turn]
     spoilt = recording([f.replace(depth=f.depth.flip(flip)) for f in frames], true)

@@ -160,6 +160,7 @@ def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
     assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
 
 
+@pytest.mark.slow
 def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, true, reference):
     """Motions that few points hold loosely are too short: of a true map they would say that it is too far."""
 
@@ -186,6 +187,7 @@ def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
     assert all(row[f"quick_far.10_{side}"] for row in told for side in ("long", "short"))
 
 
+@pytest.mark.slow
 def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
     wrong = 1.25
     swollen = [room[k].replace(depth=wrong * room[k].depth) for k in (ANCHOR, *OTHERS)]
@@ -198,6 +200,7 @@ def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
     assert validate_depth(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
 
 
+@pytest.mark.slow
 def test_exposure_of_other_views_changes_little(true, reference, others, sound):
     dim = others.replace(image=(others.image.float() / 255 * 0.7 + 0.05))
     found = validate_depth(true, reference.replace(image=reference.image.float() / 255), dim, **SMALL)
@@ -390,6 +393,7 @@ def test_a_map_without_pixels_is_refused():
         validate_depth(torch.zeros(1, 0, 0), room[0], None)
 
 
+@pytest.mark.slow
 def test_options_change_what_they_name(true, reference, others, sound):
     """One option of each kind: evidence, states and numbers of the frame."""
     maps = {"depth_map": true, "reference": reference, "others": others}

@@ -395,7 +395,10 @@ def test_a_result_is_shown_as_it_was_archived(job, command, tmp_path):
     assert data["facts"]["data"] == "synthetic" and "2 m" in data["facts"]["sensor"]
 
 
-@pytest.mark.parametrize(("there", "screen", "name"), [(True, "", "view.rrd"), (False, ":0", "view.html")])
+@pytest.mark.parametrize(
+    ("there", "screen", "name"),
+    [(True, "", "view.rrd"), pytest.param(False, ":0", "view.html", marks=pytest.mark.slow)],
+)
 def test_without_a_screen_a_recording_is_written_and_without_rerun_a_page(command, monkeypatch, there, screen, name):
     if there:
         pytest.importorskip("rerun")
