@@ -78,7 +78,7 @@ TESTS: dict[str, list[str]] = {
     "data.readers.posed_images": ["tests/cli/test_enrich.py"],
     "data.readers.record3d_live": ["tests/data/test_record3d.py"],
     "data.readers.rh20t_set": ["tests/data/test_rh20t.py"],
-    "data.readers.tum": ["tests/data/test_readers.py"],
+    "data.readers.tum": ["tests/data/test_readers.py", "tests/data/test_image_folders.py"],
     "data.recording": ["tests/data/test_ca1m.py", "tests/cli/test_scale_command.py"],
     "data.rig": ["tests/pipeline/test_rig.py", "tests/extract/test_enrich_guarantees.py"],
     "data.scene": ["tests/data/test_pairs.py"],

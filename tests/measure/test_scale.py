@@ -86,6 +86,27 @@ def test_views_of_other_pictures_are_registered(tmp_path):
     assert abs(result.scale / true - 1) < 0.02
 
 
+def test_a_frame_has_a_pose_and_depths_in_a_view_of_another_picture(tmp_path):
+    made.write_pictures(tmp_path)
+    scene, (model, true) = made.room_scene(), made.room_model("maps")
+    view = replace(model.views[2], image=tmp_path / "000002.png")
+    uv, model_depth = scale._model_depths(model, view)
+    T, depth, used = scale._register(view, scene.frames[3].to(torch.float64), uv, made.NEAR)
+    expected = np.linalg.inv(scene.poses[2]) @ scene.poses[3]
+    np.testing.assert_allclose(T.R[0], expected[:3, :3], atol=5e-3)
+    np.testing.assert_allclose(T.t[0], expected[:3, 3], atol=0.015)
+    assert int(used.sum()) > 40 and used.shape == depth.shape == model_depth.shape
+    assert float((depth / (true * model_depth) - 1)[used].abs().median()) < 0.01
+    floats = scene.frames[3].replace(image=scene.frames[3].image / 255).to(torch.float64)
+    torch.testing.assert_close(scale._register(view, floats, uv, made.NEAR)[0].t, T.t, atol=1e-4, rtol=0)
+    for lacking in (replace(view, image=None), view):
+        none, depth, used = scale._register(lacking, scene.frames[3].to(torch.float64), uv[:20], made.NEAR)
+        assert none is None and depth.shape == used.shape == (20,) and not used.any()
+    pairs = scale._measure(model, view, scene.frames[3], False, made.NEAR)
+    assert np.median(pairs.depth / pairs.model_depth / true) == pytest.approx(1, abs=0.01)
+    np.testing.assert_allclose(pairs.c2w, scene.poses[2], atol=0.015)
+
+
 def test_nothing_in_common_is_an_error():
     model, _ = made.room_model("maps")
     with pytest.raises(ValueError, match="no picture of the model and no view named"):
