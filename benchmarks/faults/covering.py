@@ -1,1293 +1,343 @@
 """Further tests of a module: other files that run its lines, found by coverage of the fast tests, file by file.
 
-First those that run lines which the tests named beside its faults do not run, then some that run many of them, quick ones
-and those of the module's package before others. Modules that no fault is written for have all their tests here.
+First those that run lines which the tests named beside its faults do not run, then some that run many of them, quick
+ones and those of the package before others. Modules that no fault is written for have all their tests here.
 """
 
-TESTS: dict[str, list[str]] = {
-    "alignment.align": [
-        "tests/alignment/test_map_family.py",
-        "tests/cli/test_align_command.py",
-        "tests/runtime/test_numerics.py",
-    ],
-    "alignment.error_model": [
-        "tests/alignment/test_map_family.py",
-        "tests/cli/test_align_command.py",
-        "tests/runtime/test_numerics.py",
-    ],
-    "alignment.map_family": ["tests/alignment/test_align.py", "tests/cli/test_align_command.py"],
-    "alignment.options": ["tests/alignment/test_map_family.py", "tests/alignment/test_align.py"],
-    "alignment.references": [
-        "tests/alignment/test_map_family.py",
-        "tests/cli/test_align_command.py",
-        "tests/runtime/test_numerics.py",
-    ],
-    "alignment.residual_noise": [
-        "tests/alignment/test_map_family.py",
-        "tests/cli/test_align_command.py",
-        "tests/runtime/test_numerics.py",
-    ],
-    "calibration": [
-        "tests/calibration/test_score_calibration.py",
-        "tests/integrations/test_lerobot_package.py",
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/docs/test_docs.py",
-    ],
-    "calibration.monotone": [
-        "tests/calibration/test_score_calibration.py",
-        "tests/experiments/test_compare_methods.py",
-    ],
-    "calibration.score_calibration": [
-        "tests/extract/test_policy_columns.py",
-        "tests/integrations/test_lerobot_package.py",
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/docs/test_docs.py",
-        "tests/test_sigma_budget.py",
-    ],
-    "cli.align": ["tests/cli/test_align_command.py"],
-    "cli.capture_checks": [
-        "tests/cli/test_capture_checks.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_enrich.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "cli.commands": [
-        "tests/cli/test_fetch.py",
-        "tests/runtime/test_allocator.py",
-        "tests/cli/test_commands.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_output.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_resume.py",
-    ],
-    "cli.complete": [
-        "tests/cli/test_complete.py",
-        "tests/cli/test_process_capture.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "cli.completed_folder": [
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_complete.py",
-    ],
-    "cli.enrich": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_enrich.py",
-        "tests/extract/test_enrich_guarantees.py",
-        "tests/test_clients.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "cli.enrich_card": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/test_clients.py",
-        "tests/cli/test_enrich.py",
-    ],
-    "cli.enrich_page": ["tests/cli/test_enrich.py", "tests/extract/test_enrich_guarantees.py"],
-    "cli.errors": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_fetch.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_resume.py",
-        "tests/cli/test_pin_command.py",
-    ],
-    "cli.fetch": ["tests/cli/test_fetch.py"],
-    "cli.inspect": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/cli/test_inspect.py",
-        "tests/cli/test_option_checks.py",
-        "tests/data/test_rlds.py",
-        "tests/data/test_lerobot.py",
-    ],
-    "cli.job": ["tests/cli/test_resume.py", "tests/cli/test_output.py", "tests/cli/test_inspect.py"],
-    "cli.layouts": [
-        "tests/cli/test_complete.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "cli.option_checks": [
-        "tests/cli/test_exit.py",
-        "tests/cli/test_option_checks.py",
-        "tests/test_settings.py",
-        "tests/cli/test_resume.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "cli.pin": ["tests/cli/test_pin_command.py"],
-    "cli.pin_words": ["tests/cli/test_pin_command.py", "tests/measure/test_pin.py"],
-    "cli.process_capture": [
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_capture_checks.py",
-        "tests/cli/test_captures_without_depth.py",
-    ],
-    "cli.recover_page": ["tests/cli/test_capture_checks.py", "tests/cli/test_process_capture.py"],
-    "cli.recover_pictures": ["tests/cli/test_process_capture.py"],
-    "cli.run": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_output.py",
-        "tests/cli/test_commands.py",
-        "tests/cli/test_option_checks.py",
-        "tests/cli/test_run.py",
-        "tests/cli/test_resume.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_validate_command.py",
-    ],
-    "cli.scale": ["tests/cli/test_scale_command.py"],
-    "cli.signals": [
-        "tests/cli/test_fetch.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_resume.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_align_command.py",
-    ],
-    "cli.stream": ["tests/cli/test_captures_without_depth.py"],
-    "cli.sweep_state": ["tests/cli/test_output.py", "tests/cli/test_option_checks.py"],
-    "cli.validate": ["tests/cli/test_validate_command.py"],
-    "cli.view": ["tests/viz/test_viewer.py"],
-    "codes": [
-        "tests/transforms/test_shown.py",
-        "tests/cli/test_pin_command.py",
-        "tests/measure/test_pin.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "data": [
-        "tests/data/test_readers.py",
-        "tests/data/test_azure_kinect.py",
-        "tests/data/test_record3d.py",
-        "tests/data/test_simulator_hdf5.py",
-        "tests/data/test_ca1m.py",
-    ],
-    "data.clocks": [
-        "tests/data/test_stray.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_rosbag.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.codecs.bag_messages": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.colmap": [
-        "tests/data/test_models.py",
-        "tests/data/test_image_folders.py",
-        "tests/cli/test_scale_command.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.codecs.exr": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_orientation.py",
-        "tests/integrate/test_level.py",
-    ],
-    "data.codecs.hdf5": ["tests/experiments/test_focal_stacks.py", "tests/robustness/test_damaged_files.py"],
-    "data.codecs.lzfse": ["tests/data/test_image_folders.py", "tests/cli/test_inspect.py"],
-    "data.codecs.matroska": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.mp4": [
-        "tests/data/test_record3d.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_rh20t.py",
-        "tests/data/test_image_folders.py",
-    ],
-    "data.codecs.npy": [
-        "tests/data/test_readers.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_models.py",
-        "tests/data/test_real_pieces.py",
-        "tests/data/test_decompression_bombs.py",
-    ],
-    "data.codecs.parquet": [
-        "tests/data/test_image_folders.py",
-        "tests/pipeline/test_rig.py",
-        "tests/data/test_real_pieces.py",
-        "tests/extract/test_shards.py",
-    ],
-    "data.codecs.pfm": ["tests/data/test_plausibility.py", "tests/data/test_real_pieces.py"],
-    "data.codecs.pgm": ["tests/data/test_plausibility.py", "tests/data/test_real_pieces.py"],
-    "data.codecs.pickles": [
-        "tests/data/test_rh20t.py",
-        "tests/data/test_decompression_bombs.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.codecs.ros_images": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.ros_messages": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.rosbag1": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.rosbag_database": ["tests/robustness/test_damaged_files.py"],
-    "data.codecs.tarballs": [
-        "tests/data/test_image_folders.py",
-        "tests/data/test_decompression_bombs.py",
-        "tests/cli/test_inspect.py",
-    ],
-    "data.codecs.tfrecord": [
-        "tests/data/test_image_folders.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "data.codecs.thrift": [
-        "tests/extract/test_shards.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_lerobot.py",
-        "tests/data/test_real_pieces.py",
-        "tests/pipeline/test_rig.py",
-    ],
-    "data.codecs.tiff": [
-        "tests/data/test_image_folders.py",
-        "tests/data/test_lerobot.py",
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-    ],
-    "data.codecs.video": [
-        "tests/data/test_azure_kinect.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_rh20t.py",
-        "tests/data/test_lerobot.py",
-        "tests/data/test_image_folders.py",
-    ],
-    "data.codecs.zips": [
-        "tests/data/test_depth_maps.py",
-        "tests/data/test_readers.py",
-        "tests/data/test_record3d.py",
-        "tests/data/test_plausibility.py",
-    ],
-    "data.convert": [
-        "tests/data/test_arkitscenes.py",
-        "tests/data/test_rlds.py",
-        "tests/data/test_pose_convention.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/data/test_rosbag.py",
-    ],
-    "data.corrections": [
-        "tests/data/test_posed_images.py",
-        "tests/data/test_rlds.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_lerobot.py",
-    ],
-    "data.depth_maps": [
-        "tests/cli/test_validate_command.py",
-        "tests/cli/test_align_command.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.foreign_files": [
-        "tests/data/test_foreign_files.py",
-        "tests/data/test_azure_kinect.py",
-        "tests/data/test_record3d.py",
-        "tests/data/test_readers.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_inspect.py",
-    ],
-    "data.intrinsics": [
-        "tests/data/test_tum.py",
-        "tests/data/test_rlds.py",
-        "tests/data/test_lerobot.py",
-        "tests/data/test_azure_kinect.py",
-        "tests/data/test_readers.py",
-    ],
-    "data.io.decode": [
-        "tests/data/test_posed_images.py",
-        "tests/data/test_orientation.py",
-        "tests/cli/test_pin_command.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_tum.py",
-        "tests/data/test_corrections.py",
-    ],
-    "data.io.safe_open": [
-        "tests/data/test_tum.py",
-        "tests/data/test_rh20t.py",
-        "tests/data/test_ca1m.py",
-        "tests/data/test_readers.py",
-        "tests/data/test_simulator_hdf5.py",
-    ],
-    "data.laser": [
-        "tests/data/test_ca1m.py",
-        "tests/data/test_arkitscenes.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.members": ["tests/data/test_image_folders.py", "tests/cli/test_inspect.py"],
-    "data.models": ["tests/data/test_models.py", "tests/cli/test_scale_command.py"],
-    "data.models.colmap": ["tests/cli/test_scale_command.py"],
-    "data.models.nerfstudio": ["tests/data/test_models.py"],
-    "data.models.scene_model": ["tests/measure/test_scale.py", "tests/cli/test_scale_command.py"],
-    "data.orientation": [
-        "tests/data/test_corrections.py",
-        "tests/data/test_posed_images.py",
-        "tests/data/test_stray.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "data.pairs": ["tests/cli/test_run.py", "tests/pipeline/test_view_report.py"],
-    "data.pickled_arrays": [
-        "tests/data/test_rh20t.py",
-        "tests/data/test_decompression_bombs.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.plausibility": [
-        "tests/data/test_depth_maps.py",
-        "tests/cli/test_validate_command.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "data.pose_convention": [
-        "tests/data/test_corrections.py",
-        "tests/validation/test_pose_check.py",
-        "tests/validation/test_capture_check.py",
-    ],
-    "data.readers.arkitscenes": ["tests/data/test_image_folders.py", "tests/cli/test_inspect.py"],
-    "data.readers.azure_kinect": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.bop": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.ca1m": ["tests/data/test_image_folders.py", "tests/robustness/test_damaged_files.py"],
-    "data.readers.colmap": ["tests/data/test_image_folders.py", "tests/robustness/test_damaged_files.py"],
-    "data.readers.driving": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/metrics/test_holdout.py",
-        "tests/cli/test_inspect.py",
-    ],
-    "data.readers.frames_dir": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/data/test_orientation.py",
-        "tests/data/test_corrections.py",
-    ],
-    "data.readers.image_table": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/data/test_orientation.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.readers.lerobot": [
-        "tests/cli/test_enrich.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_real_pieces.py",
-        "tests/pipeline/test_rig.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "data.readers.lerobot_depth": [
-        "tests/data/test_image_folders.py",
-        "tests/pipeline/test_rig.py",
-        "tests/cli/test_enrich.py",
-    ],
-    "data.readers.lerobot_meta": [
-        "tests/data/test_image_folders.py",
-        "tests/data/test_real_pieces.py",
-        "tests/pipeline/test_rig.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "data.readers.lerobot_rows": [
-        "tests/data/test_image_folders.py",
-        "tests/data/test_real_pieces.py",
-        "tests/pipeline/test_rig.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "data.readers.lerobot_video": [
-        "tests/data/test_lerobot.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_real_pieces.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_inspect.py",
-    ],
-    "data.readers.nerfstudio": ["tests/data/test_image_folders.py", "tests/robustness/test_damaged_files.py"],
-    "data.readers.open3d": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.polycam": ["tests/data/test_image_folders.py"],
-    "data.readers.posed_images": [
-        "tests/cli/test_enrich.py",
-        "tests/data/test_image_folders.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.readers.record3d": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_orientation.py",
-        "tests/integrate/test_level.py",
-    ],
-    "data.readers.record3d_live": ["tests/data/test_record3d.py"],
-    "data.readers.record3d_video": ["tests/data/test_image_folders.py", "tests/cli/test_inspect.py"],
-    "data.readers.rectified": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/pipeline/test_pair.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.readers.rh20t": ["tests/cli/test_inspect.py"],
-    "data.readers.rh20t_set": ["tests/data/test_rh20t.py"],
-    "data.readers.rlds": [
-        "tests/data/test_image_folders.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_damaged_files.py",
-    ],
-    "data.readers.rlds_steps": ["tests/robustness/test_written_values.py"],
-    "data.readers.rosbag": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.rosbag_cameras": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.rosbag_index": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.rosbag_transforms": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.scannet": ["tests/robustness/test_damaged_files.py"],
-    "data.readers.simulator_hdf5": ["tests/robustness/test_written_values.py"],
-    "data.readers.stray": [
-        "tests/data/test_plausibility.py",
-        "tests/data/test_image_folders.py",
-        "tests/cli/test_complete.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "data.readers.tum": [
-        "tests/data/test_readers.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_corrections.py",
-        "tests/data/test_plausibility.py",
-        "tests/data/test_real_pieces.py",
-        "tests/data/test_orientation.py",
-    ],
-    "data.recording": [
-        "tests/data/test_ca1m.py",
-        "tests/cli/test_scale_command.py",
-        "tests/data/test_simulator_hdf5.py",
-        "tests/data/test_arkitscenes.py",
-        "tests/data/test_rlds.py",
-        "tests/data/test_image_folders.py",
-    ],
-    "data.rig": ["tests/pipeline/test_rig.py", "tests/extract/test_enrich_guarantees.py"],
-    "data.scene": [
-        "tests/data/test_pairs.py",
-        "tests/data/test_readers.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_resume.py",
-        "tests/cli/test_captures_without_depth.py",
-    ],
-    "data.stored_sizes": [
-        "tests/data/test_posed_images.py",
-        "tests/data/test_tum.py",
-        "tests/data/test_corrections.py",
-        "tests/data/test_stray.py",
-    ],
-    "data.survey": ["tests/data/test_rlds.py", "tests/data/test_lerobot.py", "tests/cli/test_option_checks.py"],
-    "data.units": [
-        "tests/data/test_depth_maps.py",
-        "tests/data/test_corrections.py",
-        "tests/cli/test_validate_command.py",
-        "tests/data/test_image_folders.py",
-    ],
-    "data.unread": [
-        "tests/data/test_tum.py",
-        "tests/data/test_image_folders.py",
-        "tests/data/test_posed_images.py",
-        "tests/data/test_arkitscenes.py",
-        "tests/data/test_readers.py",
-        "tests/data/test_plausibility.py",
-    ],
-    "experiments.compare_methods": [
-        "tests/experiments/test_dense_comparison.py",
-        "tests/experiments/test_method_comparison.py",
-        "tests/experiments/test_xfeat.py",
-    ],
-    "experiments.probes.ridge": ["tests/test_contract.py"],
-    "export.arrays": [
-        "tests/export/test_export.py",
-        "tests/integrate/test_colmap_model.py",
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-        "tests/cli/test_complete.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.colmap": ["tests/integrate/test_colmap_model.py", "tests/robustness/test_written_values.py"],
-    "export.frames": [
-        "tests/cli/test_complete.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_process_capture.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.glb": [
-        "tests/export/test_export.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_complete.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.lerobot": [
-        "tests/test_clients.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_damaged_files.py",
-        "tests/extract/test_written_rows.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.nerfstudio": [
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.ply": [
-        "tests/export/test_export.py",
-        "tests/extract/test_written_rows.py",
-        "tests/cli/test_process_capture.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.tiff": [
-        "tests/export/test_writers.py",
-        "tests/data/test_ca1m.py",
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-        "tests/data/test_image_folders.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "export.video": [
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_process_capture.py",
-        "tests/robustness/test_resumed_outputs.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract": ["tests/extract/test_extract.py", "tests/transforms/test_dense_loader.py"],
-    "extract.columns": [
-        "tests/extract/test_policy_columns.py",
-        "tests/extract/test_written_rows.py",
-        "tests/extract/test_extract_stub.py",
-        "tests/extract/test_extract.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.cut": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_resumed_outputs.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.dataset": [
-        "tests/transforms/test_dense_loader.py",
-        "tests/extract/test_enrich_guarantees.py",
-        "tests/extract/test_written_rows.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/extract/test_extract_stub.py",
-        "tests/pipeline/test_method.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.engines": [
-        "tests/extract/test_policy_columns.py",
-        "tests/extract/test_extract.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.enriched": [
-        "tests/extract/test_policy_columns.py",
-        "tests/test_clients.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_damaged_files.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.features": [
-        "tests/extract/test_extract.py",
-        "tests/extract/test_extract_stub.py",
-        "tests/transforms/test_dense_loader.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.instants": [
-        "tests/extract/test_policy_columns.py",
-        "tests/test_clients.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_damaged_files.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.nerf_target": ["tests/test_clients.py", "tests/robustness/test_written_values.py"],
-    "extract.origin": ["tests/extract/test_policy_columns.py", "tests/robustness/test_written_values.py"],
-    "extract.pixel_columns": ["tests/extract/test_policy_columns.py", "tests/robustness/test_written_values.py"],
-    "extract.plan": [
-        "tests/extract/test_enrich_guarantees.py",
-        "tests/extract/test_written_rows.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/extract/test_extract_stub.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.policy_columns": [
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-        "tests/robustness/test_resumed_outputs.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.robot_target": [
-        "tests/extract/test_policy_columns.py",
-        "tests/robustness/test_resumed_outputs.py",
-        "tests/test_clients.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.shards": [
-        "tests/extract/test_extract_stub.py",
-        "tests/extract/test_written_rows.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/transforms/test_dense_loader.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "extract.step_set": ["tests/robustness/test_written_values.py"],
-    "extract.targets": [
-        "tests/extract/test_policy_columns.py",
-        "tests/test_clients.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/robustness/test_damaged_files.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "functional.policy_inputs": ["tests/extract/test_policy_columns.py"],
-    "geometry.affine_alignment": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/geometry/test_kornia.py",
-        "tests/geometry/test_coarse_flow.py",
-    ],
-    "geometry.camera": [
-        "tests/geometry/test_kornia.py",
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_plane_sweep.py",
-        "tests/pipeline/test_merge.py",
-        "tests/transforms/test_kornia_samples.py",
-        "tests/integrate/test_colmap_model.py",
-    ],
-    "geometry.checks": [
-        "tests/pipeline/test_accelerator.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_kornia.py",
-        "tests/losses/test_weighted.py",
-        "tests/geometry/test_affine_alignment.py",
-    ],
-    "geometry.coarse_flow": [
-        "tests/pipeline/test_guided.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/pipeline/test_few_returns.py",
-    ],
-    "geometry.components": [
-        "tests/metrics/test_map_quality.py",
-        "tests/pipeline/test_map_filters.py",
-        "tests/transforms/test_same_inputs.py",
-        "tests/pipeline/test_surface.py",
-    ],
-    "geometry.covariance": [
-        "tests/geometry/test_motion_fit.py",
-        "tests/cli/test_pin_command.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/geometry/test_kornia.py",
-        "tests/pipeline/test_pair.py",
-    ],
-    "geometry.determinism": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_affine_alignment.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/geometry/test_kornia.py",
-    ],
-    "geometry.epipolar": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_kornia.py",
-        "tests/transforms/test_shown.py",
-        "tests/stages/test_triangulate.py",
-    ],
-    "geometry.epipolar_motion": ["tests/cli/test_pin_command.py", "tests/measure/test_pin.py"],
-    "geometry.filters": [
-        "tests/geometry/test_plane_sweep.py",
-        "tests/synthetic/test_depth_faults.py",
-        "tests/data/test_posed_images.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "geometry.free_space": [
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_guided.py",
-        "tests/pipeline/test_few_returns.py",
-        "tests/pipeline/test_fused.py",
-    ],
-    "geometry.inference_mode": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_affine_alignment.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/geometry/test_kornia.py",
-    ],
-    "geometry.least_squares": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/geometry/test_kornia.py",
-        "tests/geometry/test_reprojection_problem.py",
-    ],
-    "geometry.linalg": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_kornia.py",
-        "tests/geometry/test_affine_alignment.py",
-        "tests/pipeline/test_inputs.py",
-    ],
-    "geometry.lucas_kanade": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/geometry/test_affine_alignment.py",
-        "tests/geometry/test_kornia.py",
-    ],
-    "geometry.map_estimate": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_kornia.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_guided.py",
-    ],
-    "geometry.motion_fit": ["tests/cli/test_pin_command.py"],
-    "geometry.no_depth": [
-        "tests/data/test_depth_maps.py",
-        "tests/extract/test_plan.py",
-        "tests/data/test_corrections.py",
-        "tests/transforms/test_extend_depth_stub.py",
-    ],
-    "geometry.p3p": [
-        "tests/geometry/test_ransac.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/geometry/test_kornia.py",
-    ],
-    "geometry.patches": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_kornia.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/stages/test_front_end.py",
-    ],
-    "geometry.plane_sweep": [
-        "tests/ops/test_compiled.py",
-        "tests/pipeline/test_surface.py",
-        "tests/pipeline/test_fused.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/transforms/test_same_inputs.py",
-    ],
-    "geometry.pose_conventions": [
-        "tests/transforms/test_sample_spec.py",
-        "tests/pipeline/test_rig.py",
-        "tests/pipeline/test_guided.py",
-        "tests/transforms/test_kornia_samples.py",
-    ],
-    "geometry.pyramid": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_affine_alignment.py",
-        "tests/geometry/test_reference_implementations.py",
-        "tests/geometry/test_affine_alignment_reference.py",
-    ],
-    "geometry.ransac": [
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/geometry/test_kornia.py",
-        "tests/transforms/test_shown.py",
-    ],
-    "geometry.reprojection_problem": [
-        "tests/ops/test_compiled.py",
-        "tests/geometry/test_sensor_noise.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/geometry/test_kornia.py",
-        "tests/pipeline/test_inputs.py",
-    ],
-    "geometry.se3": [
-        "tests/viz/test_plots.py",
-        "tests/cli/test_process_capture.py",
-        "tests/geometry/test_motion_fit.py",
-        "tests/geometry/test_map_estimate.py",
-        "tests/pipeline/test_guided.py",
-        "tests/pipeline/test_rig.py",
-    ],
-    "geometry.sensor_noise": [
-        "tests/cli/test_complete.py",
-        "tests/measure/test_scale.py",
-        "tests/cli/test_scale_command.py",
-    ],
-    "geometry.sparse_grid": [
-        "tests/integrate/test_integrate.py",
-        "tests/integrate/test_volume.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "geometry.windows": [
-        "tests/transforms/test_same_inputs.py",
-        "tests/pipeline/test_surface.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/pipeline/test_fused.py",
-    ],
-    "integrate.colmap_model": ["tests/robustness/test_written_values.py"],
-    "integrate.from_maps": ["tests/cli/test_process_capture.py"],
-    "integrate.level": ["tests/integrate/test_integrate.py", "tests/cli/test_process_capture.py"],
-    "integrate.mapping": ["tests/cli/test_process_capture.py"],
-    "integrate.picture": ["tests/integrate/test_picture.py"],
-    "integrate.recording": ["tests/pipeline/test_view_report.py"],
-    "integrate.scales": ["tests/cli/test_process_capture.py"],
-    "integrate.surface": ["tests/integrate/test_mapping.py", "tests/cli/test_process_capture.py"],
-    "integrate.sweeps": ["tests/viz/test_viewer.py"],
-    "integrate.volume": ["tests/cli/test_process_capture.py"],
-    "measure.change_points": ["tests/measure/test_pin.py", "tests/cli/test_pin_command.py"],
-    "measure.local_scales": ["tests/cli/test_scale_command.py"],
-    "measure.pin": ["tests/cli/test_pin_command.py"],
-    "measure.scale": ["tests/cli/test_scale_command.py"],
-    "metrics.bootstrap": [
-        "tests/experiments/test_defocus_fusion.py",
-        "tests/experiments/test_method_comparison.py",
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/learning/test_learned_confidence.py",
-    ],
-    "metrics.camera_paths": ["tests/measure/test_scale.py", "tests/cli/test_scale_command.py"],
-    "metrics.change_points": ["tests/cli/test_pin_command.py"],
-    "metrics.control": ["tests/experiments/test_compare_methods.py", "tests/calibration/test_score_calibration.py"],
-    "metrics.correlation": [
-        "tests/metrics/test_risk.py",
-        "tests/experiments/test_protocols.py",
-        "tests/learning/test_learned_confidence.py",
-        "tests/experiments/test_defocus_fusion.py",
-    ],
-    "metrics.curves": [
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/experiments/test_xfeat.py",
-        "tests/learning/test_learned_confidence.py",
-        "tests/experiments/test_method_comparison.py",
-    ],
-    "metrics.detection": ["tests/validation/test_wrong_causes.py"],
-    "metrics.errors": [
-        "tests/metrics/test_risk.py",
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/learning/test_learned_confidence.py",
-        "tests/experiments/test_xfeat.py",
-    ],
-    "metrics.grouped": ["tests/measure/test_scale.py", "tests/cli/test_scale_command.py"],
-    "metrics.holdout": [
-        "tests/experiments/test_protocols.py",
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/experiments/test_xfeat.py",
-        "tests/learning/test_learned_confidence.py",
-    ],
-    "metrics.map_quality": ["tests/pipeline/test_map_filters.py"],
-    "metrics.reliability": [
-        "tests/metrics/test_errors.py",
-        "tests/experiments/test_compare_methods.py",
-        "tests/experiments/test_xfeat.py",
-        "tests/experiments/test_method_comparison.py",
-        "tests/experiments/test_uncertainty_study.py",
-    ],
-    "metrics.risk": [
-        "tests/metrics/test_uncertainty.py",
-        "tests/experiments/test_xfeat.py",
-        "tests/experiments/test_method_comparison.py",
-        "tests/experiments/test_compare_methods.py",
-    ],
-    "metrics.uncertainty": [
-        "tests/experiments/test_uncertainty_study.py",
-        "tests/experiments/test_method_comparison.py",
-        "tests/experiments/test_compare_methods.py",
-        "tests/experiments/test_xfeat.py",
-    ],
-    "pipeline.completion": [
-        "tests/extract/test_policy_columns.py",
-        "tests/test_sigma_budget.py",
-        "tests/cli/test_process_capture.py",
-        "tests/transforms/test_same_inputs.py",
-    ],
-    "pipeline.dense": [
-        "tests/ops/test_compiled.py",
-        "tests/pipeline/test_fused.py",
-        "tests/transforms/test_same_inputs.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/test_sigma_budget.py",
-    ],
-    "pipeline.fused": ["tests/test_sigma_budget.py", "tests/runtime/test_numerics.py", "tests/viz/test_viewer.py"],
-    "pipeline.inputs": [
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_guided.py",
-        "tests/pipeline/test_merge.py",
-        "tests/pipeline/test_multiview.py",
-        "tests/pipeline/test_fused.py",
-    ],
-    "pipeline.map_filters": [
-        "tests/pipeline/test_surface.py",
-        "tests/pipeline/test_fused.py",
-        "tests/pipeline/test_dense.py",
-        "tests/transforms/test_same_inputs.py",
-    ],
-    "pipeline.method": [
-        "tests/transforms/test_shown.py",
-        "tests/stages/test_pose_prior.py",
-        "tests/pipeline/test_fused.py",
-        "tests/pipeline/test_merge.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_rig.py",
-    ],
-    "pipeline.multiview": [
-        "tests/cli/test_captures_without_depth.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_view_report.py",
-        "tests/pipeline/test_few_returns.py",
-        "tests/pipeline/test_stream.py",
-        "tests/pipeline/test_method.py",
-    ],
-    "pipeline.pair": [
-        "tests/ops/test_compiled.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_rig.py",
-        "tests/pipeline/test_view_report.py",
-        "tests/pipeline/test_degenerate.py",
-    ],
-    "pipeline.picture_matching": ["tests/cli/test_scale_command.py"],
-    "pipeline.planes": [
-        "tests/pipeline/test_surface.py",
-        "tests/pipeline/test_fused.py",
-        "tests/pipeline/test_dense.py",
-        "tests/test_sigma_budget.py",
-    ],
-    "pipeline.presets": [
-        "tests/pipeline/test_rig.py",
-        "tests/test_clients.py",
-        "tests/transforms/test_extend_depth_stub.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "pipeline.rig": ["tests/docs/test_docs.py"],
-    "pipeline.spec": [
-        "tests/pipeline/test_rig.py",
-        "tests/integrations/test_lerobot_package.py",
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_extend_depth_stub.py",
-    ],
-    "pipeline.stream": ["tests/cli/test_captures_without_depth.py"],
-    "pipeline.surface": [
-        "tests/ops/test_compiled.py",
-        "tests/pipeline/test_fused.py",
-        "tests/transforms/test_same_inputs.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/test_sigma_budget.py",
-    ],
-    "pipeline.view_report": ["tests/viz/test_viewer.py", "tests/cli/test_process_capture.py"],
-    "pipeline.view_selection": [
-        "tests/pipeline/test_view_report.py",
-        "tests/cli/test_captures_without_depth.py",
-        "tests/cli/test_process_capture.py",
-        "tests/pipeline/test_multiview.py",
-    ],
-    "pytree": [
-        "tests/stages/test_inverse_variance.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_rig.py",
-        "tests/pipeline/test_guided.py",
-    ],
-    "records": [
-        "tests/pipeline/test_merge.py",
-        "tests/pipeline/test_fused.py",
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_complete.py",
-        "tests/test_sigma_budget.py",
-        "tests/pipeline/test_guided.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/geometry/test_sensor_noise.py",
-    ],
-    "runtime.allocator": [
-        "tests/extract/test_shards.py",
-        "tests/test_clients.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_pin_command.py",
-    ],
-    "runtime.code_dependencies": [
-        "tests/runtime/test_results.py",
-        "tests/test_clients.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_resume.py",
-    ],
-    "runtime.console": [
-        "tests/cli/test_fetch.py",
-        "tests/runtime/test_allocator.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_commands.py",
-        "tests/cli/test_output.py",
-        "tests/test_clients.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/data/test_lerobot.py",
-        "tests/cli/test_resume.py",
-    ],
-    "runtime.file_lock": [
-        "tests/runtime/test_output_folder.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_fetch.py",
-        "tests/test_clients.py",
-        "tests/data/test_rlds.py",
-    ],
-    "runtime.numerics": [
-        "tests/runtime/test_numerics.py",
-        "tests/transforms/test_shown.py",
-        "tests/integrations/test_lerobot_package.py",
-        "tests/data/test_tum.py",
-        "tests/functional/test_policy_inputs.py",
-    ],
-    "runtime.output_folder": [
-        "tests/cli/test_fetch.py",
-        "tests/test_clients.py",
-        "tests/cli/test_align_command.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "runtime.ply": [
-        "tests/data/test_models.py",
-        "tests/viz/test_plots.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "runtime.results": [
-        "tests/cli/test_resume.py",
-        "tests/cli/test_exit.py",
-        "tests/cli/test_run.py",
-        "tests/extract/test_policy_columns.py",
-    ],
-    "runtime.storage": [
-        "tests/data/test_models.py",
-        "tests/cli/test_exit.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/extract/test_written_rows.py",
-        "tests/test_clients.py",
-        "tests/extract/test_shards.py",
-    ],
-    "stages.backproject": [
-        "tests/ops/test_compiled.py",
-        "tests/stages/test_inverse_variance.py",
-        "tests/stages/test_guided_search.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_misalignment.py",
-    ],
-    "stages.features": ["tests/geometry/test_kornia.py"],
-    "stages.fuse": [
-        "tests/stages/test_misalignment.py",
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_view_report.py",
-        "tests/pipeline/test_few_returns.py",
-    ],
-    "stages.guided_search": ["tests/pipeline/test_guided.py"],
-    "stages.holes": [
-        "tests/ops/test_compiled.py",
-        "tests/stages/test_inverse_variance.py",
-        "tests/stages/test_guided_search.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_misalignment.py",
-    ],
-    "stages.kornia.backproject": ["tests/test_sigma_budget.py"],
-    "stages.kornia.holes": ["tests/test_sigma_budget.py"],
-    "stages.kornia.pose": ["tests/test_sigma_budget.py"],
-    "stages.kornia.track": ["tests/stages/test_track_chain.py", "tests/test_sigma_budget.py"],
-    "stages.kornia.triangulate": ["tests/test_sigma_budget.py"],
-    "stages.misalignment": [
-        "tests/ops/test_compiled.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_features.py",
-        "tests/stages/test_fuse.py",
-        "tests/geometry/test_sensor_noise.py",
-    ],
-    "stages.pose": [
-        "tests/ops/test_compiled.py",
-        "tests/stages/test_pose_prior.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_misalignment.py",
-        "tests/stages/test_features.py",
-        "tests/stages/test_fuse.py",
-    ],
-    "stages.pose_prior": ["tests/pipeline/test_rig.py", "tests/pipeline/test_guided.py"],
-    "stages.sample": [
-        "tests/stages/test_inverse_variance.py",
-        "tests/stages/test_guided_search.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_misalignment.py",
-    ],
-    "stages.score": [
-        "tests/test_gradients.py",
-        "tests/stages/test_pose_prior.py",
-        "tests/pipeline/test_view_report.py",
-        "tests/pipeline/test_pair.py",
-    ],
-    "stages.shared_error": [
-        "tests/pipeline/test_inputs.py",
-        "tests/pipeline/test_guided.py",
-        "tests/pipeline/test_few_returns.py",
-        "tests/pipeline/test_fused.py",
-    ],
-    "stages.track": [
-        "tests/stages/test_track_chain.py",
-        "tests/stages/test_inverse_variance.py",
-        "tests/stages/test_contradicted.py",
-        "tests/stages/test_misalignment.py",
-        "tests/pipeline/test_guided.py",
-    ],
-    "stages.triangulate": [
-        "tests/stages/test_misalignment.py",
-        "tests/stages/test_inverse_variance.py",
-        "tests/stages/test_features.py",
-        "tests/stages/test_fuse.py",
-    ],
-    "transforms.adapters": [
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_dense_loader.py",
-        "tests/transforms/test_extend_depth.py",
-        "tests/test_clients.py",
-    ],
-    "transforms.collate": [
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_flagged_epoch.py",
-        "tests/transforms/test_extend_depth.py",
-    ],
-    "transforms.extend_depth": [
-        "tests/transforms/test_flagged_epoch.py",
-        "tests/transforms/test_extend_depth.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_same_inputs.py",
-        "tests/transforms/test_dense_loader.py",
-    ],
-    "transforms.kornia": ["tests/geometry/test_kornia.py"],
-    "transforms.layout": [
-        "tests/transforms/test_extend_depth_stub.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_dense_loader.py",
-    ],
-    "transforms.maps": [
-        "tests/integrations/test_lerobot_package.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/stages/test_pose_prior.py",
-    ],
-    "transforms.poses": [
-        "tests/pipeline/test_rig.py",
-        "tests/transforms/test_sample_spec.py",
-        "tests/transforms/test_kornia_samples.py",
-    ],
-    "transforms.sample_access": [
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_kornia_samples.py",
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_flagged_epoch.py",
-    ],
-    "transforms.sample_spec": [
-        "tests/transforms/test_extend_depth_stub.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_shown.py",
-    ],
-    "transforms.schema": [
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_flagged_epoch.py",
-    ],
-    "transforms.status": [
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_adapters.py",
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_flagged_epoch.py",
-    ],
-    "transforms.tokens": [
-        "tests/ops/test_compiled.py",
-        "tests/transforms/test_extend_depth_stub.py",
-        "tests/transforms/test_shown.py",
-        "tests/transforms/test_wrappers.py",
-        "tests/transforms/test_same_inputs.py",
-    ],
-    "validation.capture_check": [
-        "tests/data/test_rlds.py",
-        "tests/extract/test_policy_columns.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_inspect.py",
-    ],
-    "validation.edge_fault": ["tests/validation/test_capture_check.py", "tests/cli/test_process_capture.py"],
-    "validation.edge_lag": ["tests/validation/test_capture_check.py", "tests/cli/test_process_capture.py"],
-    "validation.evidence": [
-        "tests/validation/test_wrong_causes.py",
-        "tests/runtime/test_numerics.py",
-        "tests/cli/test_validate_command.py",
-    ],
-    "validation.faults": ["tests/validation/test_capture_check.py", "tests/extract/test_policy_columns.py"],
-    "validation.options": ["tests/validation/test_wrong_causes.py", "tests/validation/test_validate.py"],
-    "validation.picture_field": [
-        "tests/cli/test_scale_command.py",
-        "tests/cli/test_complete.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "validation.pose_check": ["tests/validation/test_capture_check.py", "tests/extract/test_policy_columns.py"],
-    "validation.validate": ["tests/runtime/test_numerics.py", "tests/cli/test_validate_command.py"],
-    "validation.wrong_causes": ["tests/validation/test_validate.py", "tests/runtime/test_numerics.py"],
-    "viz.plots.axis": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/experiments/test_sweep_tables.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_align_command.py",
-    ],
-    "viz.plots.canvas": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_plots.py",
-        "tests/viz/test_viewer.py",
-        "tests/data/test_rlds.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_validate_command.py",
-        "tests/cli/test_pin_command.py",
-    ],
-    "viz.plots.colours": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_viewer_cameras.py",
-        "tests/viz/test_plots.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_validate_command.py",
-    ],
-    "viz.plots.document": [
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_validate_command.py",
-        "tests/cli/test_scale_command.py",
-        "tests/viz/test_viewer_cameras.py",
-    ],
-    "viz.plots.maps": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_process_capture.py",
-        "tests/cli/test_complete.py",
-        "tests/cli/test_validate_command.py",
-    ],
-    "viz.plots.markup": [
-        "tests/experiments/test_sweep_tables.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_align_command.py",
-    ],
-    "viz.plots.panel": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_plots.py",
-        "tests/experiments/test_sweep_tables.py",
-        "tests/cli/test_pin_command.py",
-        "tests/cli/test_scale_command.py",
-    ],
-    "viz.plots.pictures": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/docs/test_report.py",
-        "tests/docs/test_report_page.py",
-        "tests/viz/test_viewer.py",
-    ],
-    "viz.plots.previews": ["tests/viz/test_drawn_figures.py", "tests/cli/test_process_capture.py"],
-    "viz.plots.svg": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_plots.py",
-        "tests/cli/test_pin_command.py",
-        "tests/robustness/test_resumed_outputs.py",
-    ],
-    "viz.plots.validation": [
-        "tests/viz/test_drawn_figures.py",
-        "tests/viz/test_plots.py",
-        "tests/cli/test_validate_command.py",
-    ],
-    "viz.viewer.again": ["tests/viz/test_viewer.py"],
-    "viz.viewer.exhibit": [
-        "tests/viz/test_viewer_cameras.py",
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_process_capture.py",
-    ],
-    "viz.viewer.html": [
-        "tests/viz/test_viewer.py",
-        "tests/cli/test_process_capture.py",
-        "tests/robustness/test_written_values.py",
-    ],
-    "viz.viewer.pin": ["tests/cli/test_pin_command.py"],
-    "viz.viewer.points": ["tests/viz/test_viewer.py", "tests/cli/test_process_capture.py"],
-    "viz.viewer.validation": [
-        "tests/cli/test_validate_command.py",
-        "tests/cli/test_align_command.py",
-        "tests/cli/test_scale_command.py",
-    ],
-}
+from collections import defaultdict
+
+#: Module and files, ``cli/complete`` for ``tests/cli/test_complete.py``; a module may have several rows.
+_TABLE = """
+alignment.align alignment/map_family cli/align_command runtime/numerics
+alignment.error_model alignment/map_family cli/align_command runtime/numerics
+alignment.map_family alignment/align cli/align_command
+alignment.options alignment/map_family alignment/align
+alignment.references alignment/map_family cli/align_command runtime/numerics
+alignment.residual_noise alignment/map_family cli/align_command runtime/numerics
+calibration calibration/score_calibration integrations/lerobot_package experiments/uncertainty_study
+calibration extract/policy_columns docs/docs
+calibration.monotone calibration/score_calibration experiments/compare_methods
+calibration.score_calibration extract/policy_columns integrations/lerobot_package experiments/uncertainty_study
+calibration.score_calibration docs/docs test_sigma_budget
+cli.align cli/align_command
+cli.capture_checks cli/capture_checks cli/captures_without_depth cli/enrich extract/policy_columns
+cli.commands cli/fetch runtime/allocator cli/commands cli/exit cli/output cli/captures_without_depth cli/resume
+cli.complete cli/complete cli/process_capture robustness/written_values
+cli.completed_folder cli/process_capture cli/align_command cli/complete
+cli.enrich cli/captures_without_depth cli/enrich extract/enrich_guarantees test_clients extract/policy_columns
+cli.enrich robustness/written_values
+cli.enrich_card cli/captures_without_depth extract/policy_columns test_clients cli/enrich
+cli.enrich_page cli/enrich extract/enrich_guarantees
+cli.errors cli/captures_without_depth cli/fetch cli/exit cli/resume cli/pin_command
+cli.fetch cli/fetch
+cli.inspect viz/drawn_figures cli/inspect cli/option_checks data/rlds data/lerobot
+cli.job cli/resume cli/output cli/inspect
+cli.layouts cli/complete cli/align_command cli/process_capture
+cli.option_checks cli/exit cli/option_checks test_settings cli/resume cli/captures_without_depth cli/align_command
+cli.option_checks cli/process_capture
+cli.pin cli/pin_command
+cli.pin_words cli/pin_command measure/pin
+cli.process_capture cli/process_capture cli/capture_checks cli/captures_without_depth
+cli.recover_page cli/capture_checks cli/process_capture
+cli.recover_pictures cli/process_capture
+cli.run cli/captures_without_depth cli/output cli/commands cli/option_checks cli/run cli/resume cli/align_command
+cli.run cli/process_capture cli/validate_command
+cli.scale cli/scale_command
+cli.signals cli/fetch cli/exit cli/pin_command cli/resume cli/captures_without_depth cli/align_command
+cli.stream cli/captures_without_depth
+cli.sweep_state cli/output cli/option_checks
+cli.validate cli/validate_command
+cli.view viz/viewer
+codes transforms/shown cli/pin_command measure/pin cli/process_capture
+data data/readers data/azure_kinect data/record3d data/simulator_hdf5 data/ca1m
+data.clocks data/stray data/image_folders data/rosbag robustness/damaged_files
+data.codecs.bag_messages robustness/damaged_files
+data.codecs.colmap data/models data/image_folders cli/scale_command robustness/damaged_files
+data.codecs.exr data/plausibility data/image_folders data/orientation integrate/level
+data.codecs.hdf5 experiments/focal_stacks robustness/damaged_files
+data.codecs.lzfse data/image_folders cli/inspect
+data.codecs.matroska robustness/damaged_files
+data.codecs.mp4 data/record3d data/plausibility data/rh20t data/image_folders
+data.codecs.npy data/readers data/plausibility data/models data/real_pieces data/decompression_bombs
+data.codecs.parquet data/image_folders pipeline/rig data/real_pieces extract/shards
+data.codecs.pfm data/plausibility data/real_pieces
+data.codecs.pgm data/plausibility data/real_pieces
+data.codecs.pickles data/rh20t data/decompression_bombs robustness/damaged_files
+data.codecs.ros_images robustness/damaged_files
+data.codecs.ros_messages robustness/damaged_files
+data.codecs.rosbag1 robustness/damaged_files
+data.codecs.rosbag_database robustness/damaged_files
+data.codecs.tarballs data/image_folders data/decompression_bombs cli/inspect
+data.codecs.tfrecord data/image_folders test_clients robustness/written_values
+data.codecs.thrift extract/shards data/image_folders data/lerobot data/real_pieces pipeline/rig
+data.codecs.tiff data/image_folders data/lerobot extract/written_rows test_clients
+data.codecs.video data/azure_kinect data/plausibility data/rh20t data/lerobot data/image_folders
+data.codecs.zips data/depth_maps data/readers data/record3d data/plausibility
+data.convert data/arkitscenes data/rlds data/pose_convention data/image_folders data/plausibility data/real_pieces
+data.convert data/rosbag
+data.corrections data/posed_images data/rlds data/image_folders data/lerobot
+data.depth_maps cli/validate_command cli/align_command robustness/damaged_files
+data.foreign_files data/foreign_files data/azure_kinect data/record3d data/readers cli/captures_without_depth
+data.foreign_files cli/inspect
+data.intrinsics data/tum data/rlds data/lerobot data/azure_kinect data/readers
+data.io.decode data/posed_images data/orientation cli/pin_command data/plausibility data/image_folders data/tum
+data.io.decode data/corrections
+data.io.safe_open data/tum data/rh20t data/ca1m data/readers data/simulator_hdf5
+data.laser data/ca1m data/arkitscenes robustness/damaged_files
+data.members data/image_folders cli/inspect
+data.models data/models cli/scale_command
+data.models.colmap cli/scale_command
+data.models.nerfstudio data/models
+data.models.scene_model measure/scale cli/scale_command
+data.orientation data/corrections data/posed_images data/stray extract/policy_columns cli/process_capture
+data.pairs cli/run pipeline/view_report
+data.pickled_arrays data/rh20t data/decompression_bombs robustness/damaged_files
+data.plausibility data/depth_maps cli/validate_command cli/captures_without_depth cli/process_capture
+data.pose_convention data/corrections validation/pose_check validation/capture_check
+data.readers.arkitscenes data/image_folders cli/inspect
+data.readers.azure_kinect robustness/damaged_files
+data.readers.bop robustness/damaged_files
+data.readers.ca1m data/image_folders robustness/damaged_files
+data.readers.colmap data/image_folders robustness/damaged_files
+data.readers.driving data/plausibility data/real_pieces metrics/holdout cli/inspect
+data.readers.frames_dir data/plausibility data/real_pieces data/orientation data/corrections
+data.readers.image_table data/plausibility data/real_pieces data/orientation robustness/damaged_files
+data.readers.lerobot cli/enrich data/image_folders data/real_pieces pipeline/rig extract/policy_columns
+data.readers.lerobot_depth data/image_folders pipeline/rig cli/enrich
+data.readers.lerobot_meta data/image_folders data/real_pieces pipeline/rig extract/policy_columns
+data.readers.lerobot_rows data/image_folders data/real_pieces pipeline/rig extract/policy_columns
+data.readers.lerobot_video data/lerobot data/image_folders data/real_pieces extract/policy_columns cli/inspect
+data.readers.nerfstudio data/image_folders robustness/damaged_files
+data.readers.open3d robustness/damaged_files
+data.readers.polycam data/image_folders
+data.readers.posed_images cli/enrich data/image_folders robustness/damaged_files
+data.readers.record3d data/plausibility data/image_folders data/orientation integrate/level
+data.readers.record3d_live data/record3d
+data.readers.record3d_video data/image_folders cli/inspect
+data.readers.rectified data/plausibility data/real_pieces pipeline/pair robustness/damaged_files
+data.readers.rh20t cli/inspect
+data.readers.rh20t_set data/rh20t
+data.readers.rlds data/image_folders test_clients robustness/damaged_files
+data.readers.rlds_steps robustness/written_values
+data.readers.rosbag robustness/damaged_files
+data.readers.rosbag_cameras robustness/damaged_files
+data.readers.rosbag_index robustness/damaged_files
+data.readers.rosbag_transforms robustness/damaged_files
+data.readers.scannet robustness/damaged_files
+data.readers.simulator_hdf5 robustness/written_values
+data.readers.stray data/plausibility data/image_folders cli/complete cli/process_capture
+data.readers.tum data/readers data/image_folders data/corrections data/plausibility data/real_pieces data/orientation
+data.recording data/ca1m cli/scale_command data/simulator_hdf5 data/arkitscenes data/rlds data/image_folders
+data.rig pipeline/rig extract/enrich_guarantees
+data.scene data/pairs data/readers extract/policy_columns cli/resume cli/captures_without_depth
+data.stored_sizes data/posed_images data/tum data/corrections data/stray
+data.survey data/rlds data/lerobot cli/option_checks
+data.units data/depth_maps data/corrections cli/validate_command data/image_folders
+data.unread data/tum data/image_folders data/posed_images data/arkitscenes data/readers data/plausibility
+experiments.compare_methods experiments/dense_comparison experiments/method_comparison experiments/xfeat
+experiments.probes.ridge test_contract
+export.arrays export/export integrate/colmap_model extract/written_rows test_clients cli/complete
+export.arrays robustness/written_values
+export.colmap integrate/colmap_model robustness/written_values
+export.frames cli/complete cli/align_command cli/process_capture robustness/written_values
+export.glb export/export cli/process_capture cli/complete robustness/written_values
+export.lerobot test_clients extract/policy_columns cli/captures_without_depth robustness/damaged_files
+export.lerobot extract/written_rows robustness/written_values
+export.nerfstudio extract/written_rows test_clients robustness/written_values
+export.ply export/export extract/written_rows cli/process_capture test_clients robustness/written_values
+export.tiff export/writers data/ca1m extract/written_rows test_clients data/image_folders robustness/written_values
+export.video extract/policy_columns cli/process_capture robustness/resumed_outputs robustness/written_values
+extract extract/extract transforms/dense_loader
+extract.columns extract/policy_columns extract/written_rows extract/extract_stub extract/extract
+extract.columns robustness/written_values
+extract.cut cli/captures_without_depth robustness/resumed_outputs robustness/written_values
+extract.dataset transforms/dense_loader extract/enrich_guarantees extract/written_rows extract/policy_columns
+extract.dataset extract/extract_stub pipeline/method robustness/written_values
+extract.engines extract/policy_columns extract/extract test_clients robustness/written_values
+extract.enriched extract/policy_columns test_clients cli/captures_without_depth robustness/damaged_files
+extract.enriched robustness/written_values
+extract.features extract/extract extract/extract_stub transforms/dense_loader robustness/written_values
+extract.instants extract/policy_columns test_clients cli/captures_without_depth robustness/damaged_files
+extract.instants robustness/written_values
+extract.nerf_target test_clients robustness/written_values
+extract.origin extract/policy_columns robustness/written_values
+extract.pixel_columns extract/policy_columns robustness/written_values
+extract.plan extract/enrich_guarantees extract/written_rows extract/policy_columns extract/extract_stub test_clients
+extract.plan robustness/written_values
+extract.policy_columns extract/written_rows test_clients robustness/resumed_outputs cli/captures_without_depth
+extract.policy_columns robustness/written_values
+extract.robot_target extract/policy_columns robustness/resumed_outputs test_clients cli/captures_without_depth
+extract.robot_target robustness/written_values
+extract.shards extract/extract_stub extract/written_rows extract/policy_columns transforms/dense_loader
+extract.shards robustness/written_values
+extract.step_set robustness/written_values
+extract.targets extract/policy_columns test_clients cli/captures_without_depth robustness/damaged_files
+extract.targets robustness/written_values
+functional.policy_inputs extract/policy_columns
+geometry.affine_alignment ops/compiled geometry/sensor_noise geometry/reference_implementations geometry/kornia
+geometry.affine_alignment geometry/coarse_flow
+geometry.camera geometry/kornia ops/compiled geometry/plane_sweep pipeline/merge transforms/kornia_samples
+geometry.camera integrate/colmap_model
+geometry.checks pipeline/accelerator geometry/sensor_noise geometry/kornia losses/weighted geometry/affine_alignment
+geometry.coarse_flow pipeline/guided pipeline/inputs extract/policy_columns pipeline/few_returns
+geometry.components metrics/map_quality pipeline/map_filters transforms/same_inputs pipeline/surface
+geometry.covariance geometry/motion_fit cli/pin_command geometry/sensor_noise geometry/map_estimate geometry/kornia
+geometry.covariance pipeline/pair
+geometry.determinism geometry/sensor_noise geometry/affine_alignment geometry/reference_implementations
+geometry.determinism geometry/kornia
+geometry.epipolar ops/compiled geometry/sensor_noise geometry/kornia transforms/shown stages/triangulate
+geometry.epipolar_motion cli/pin_command measure/pin
+geometry.filters geometry/plane_sweep synthetic/depth_faults data/posed_images extract/policy_columns
+geometry.free_space pipeline/inputs pipeline/guided pipeline/few_returns pipeline/fused
+geometry.inference_mode geometry/sensor_noise geometry/affine_alignment geometry/reference_implementations
+geometry.inference_mode geometry/kornia
+geometry.least_squares ops/compiled geometry/sensor_noise geometry/map_estimate geometry/kornia
+geometry.least_squares geometry/reprojection_problem
+geometry.linalg geometry/sensor_noise geometry/kornia geometry/affine_alignment pipeline/inputs
+geometry.lucas_kanade ops/compiled geometry/sensor_noise geometry/reference_implementations geometry/affine_alignment
+geometry.lucas_kanade geometry/kornia
+geometry.map_estimate geometry/sensor_noise geometry/kornia pipeline/inputs pipeline/guided
+geometry.motion_fit cli/pin_command
+geometry.no_depth data/depth_maps extract/plan data/corrections transforms/extend_depth_stub
+geometry.p3p geometry/ransac geometry/sensor_noise geometry/map_estimate geometry/kornia
+geometry.patches ops/compiled geometry/sensor_noise geometry/kornia geometry/reference_implementations
+geometry.patches stages/front_end
+geometry.plane_sweep ops/compiled pipeline/surface pipeline/fused extract/policy_columns transforms/same_inputs
+geometry.pose_conventions transforms/sample_spec pipeline/rig pipeline/guided transforms/kornia_samples
+geometry.pyramid geometry/sensor_noise geometry/affine_alignment geometry/reference_implementations
+geometry.pyramid geometry/affine_alignment_reference
+geometry.ransac geometry/sensor_noise geometry/map_estimate geometry/kornia transforms/shown
+geometry.reprojection_problem ops/compiled geometry/sensor_noise geometry/map_estimate geometry/kornia pipeline/inputs
+geometry.se3 viz/plots cli/process_capture geometry/motion_fit geometry/map_estimate pipeline/guided pipeline/rig
+geometry.sensor_noise cli/complete measure/scale cli/scale_command
+geometry.sparse_grid integrate/integrate integrate/volume cli/process_capture
+geometry.windows transforms/same_inputs pipeline/surface extract/policy_columns pipeline/fused
+integrate.colmap_model robustness/written_values
+integrate.from_maps cli/process_capture
+integrate.level integrate/integrate cli/process_capture
+integrate.mapping cli/process_capture
+integrate.picture integrate/picture
+integrate.recording pipeline/view_report
+integrate.scales cli/process_capture
+integrate.surface integrate/mapping cli/process_capture
+integrate.sweeps viz/viewer
+integrate.volume cli/process_capture
+measure.change_points measure/pin cli/pin_command
+measure.local_scales cli/scale_command
+measure.pin cli/pin_command
+measure.scale cli/scale_command
+metrics.bootstrap experiments/defocus_fusion experiments/method_comparison experiments/uncertainty_study
+metrics.bootstrap learning/learned_confidence
+metrics.camera_paths measure/scale cli/scale_command
+metrics.change_points cli/pin_command
+metrics.control experiments/compare_methods calibration/score_calibration
+metrics.correlation metrics/risk experiments/protocols learning/learned_confidence experiments/defocus_fusion
+metrics.curves experiments/uncertainty_study experiments/xfeat learning/learned_confidence
+metrics.curves experiments/method_comparison
+metrics.detection validation/wrong_causes
+metrics.errors metrics/risk experiments/uncertainty_study learning/learned_confidence experiments/xfeat
+metrics.grouped measure/scale cli/scale_command
+metrics.holdout experiments/protocols experiments/uncertainty_study experiments/xfeat learning/learned_confidence
+metrics.map_quality pipeline/map_filters
+metrics.reliability metrics/errors experiments/compare_methods experiments/xfeat experiments/method_comparison
+metrics.reliability experiments/uncertainty_study
+metrics.risk metrics/uncertainty experiments/xfeat experiments/method_comparison experiments/compare_methods
+metrics.uncertainty experiments/uncertainty_study experiments/method_comparison experiments/compare_methods
+metrics.uncertainty experiments/xfeat
+pipeline.completion extract/policy_columns test_sigma_budget cli/process_capture transforms/same_inputs
+pipeline.dense ops/compiled pipeline/fused transforms/same_inputs extract/policy_columns test_sigma_budget
+pipeline.fused test_sigma_budget runtime/numerics viz/viewer
+pipeline.inputs pipeline/inputs pipeline/guided pipeline/merge pipeline/multiview pipeline/fused
+pipeline.map_filters pipeline/surface pipeline/fused pipeline/dense transforms/same_inputs
+pipeline.method transforms/shown stages/pose_prior pipeline/fused pipeline/merge pipeline/inputs pipeline/rig
+pipeline.multiview cli/captures_without_depth pipeline/inputs pipeline/view_report pipeline/few_returns
+pipeline.multiview pipeline/stream pipeline/method
+pipeline.pair ops/compiled pipeline/inputs pipeline/rig pipeline/view_report pipeline/degenerate
+pipeline.picture_matching cli/scale_command
+pipeline.planes pipeline/surface pipeline/fused pipeline/dense test_sigma_budget
+pipeline.presets pipeline/rig test_clients transforms/extend_depth_stub extract/policy_columns
+pipeline.rig docs/docs
+pipeline.spec pipeline/rig integrations/lerobot_package transforms/wrappers transforms/extend_depth_stub
+pipeline.stream cli/captures_without_depth
+pipeline.surface ops/compiled pipeline/fused transforms/same_inputs extract/policy_columns test_sigma_budget
+pipeline.view_report viz/viewer cli/process_capture
+pipeline.view_selection pipeline/view_report cli/captures_without_depth cli/process_capture pipeline/multiview
+pytree stages/inverse_variance pipeline/inputs pipeline/rig pipeline/guided
+records pipeline/merge pipeline/fused cli/pin_command cli/complete test_sigma_budget pipeline/guided
+records extract/policy_columns geometry/sensor_noise
+runtime.allocator extract/shards test_clients extract/policy_columns cli/pin_command
+runtime.code_dependencies runtime/results test_clients extract/policy_columns cli/resume
+runtime.console cli/fetch runtime/allocator cli/exit cli/commands cli/output test_clients extract/policy_columns
+runtime.console data/lerobot cli/resume
+runtime.file_lock runtime/output_folder cli/exit cli/fetch test_clients data/rlds
+runtime.numerics runtime/numerics transforms/shown integrations/lerobot_package data/tum functional/policy_inputs
+runtime.output_folder cli/fetch test_clients cli/align_command extract/policy_columns
+runtime.ply data/models viz/plots viz/viewer cli/process_capture
+runtime.results cli/resume cli/exit cli/run extract/policy_columns
+runtime.storage data/models cli/exit extract/policy_columns extract/written_rows test_clients extract/shards
+stages.backproject ops/compiled stages/inverse_variance stages/guided_search stages/contradicted stages/misalignment
+stages.features geometry/kornia
+stages.fuse stages/misalignment pipeline/inputs pipeline/view_report pipeline/few_returns
+stages.guided_search pipeline/guided
+stages.holes ops/compiled stages/inverse_variance stages/guided_search stages/contradicted stages/misalignment
+stages.kornia.backproject test_sigma_budget
+stages.kornia.holes test_sigma_budget
+stages.kornia.pose test_sigma_budget
+stages.kornia.track stages/track_chain test_sigma_budget
+stages.kornia.triangulate test_sigma_budget
+stages.misalignment ops/compiled stages/contradicted stages/features stages/fuse geometry/sensor_noise
+stages.pose ops/compiled stages/pose_prior stages/contradicted stages/misalignment stages/features stages/fuse
+stages.pose_prior pipeline/rig pipeline/guided
+stages.sample stages/inverse_variance stages/guided_search stages/contradicted stages/misalignment
+stages.score test_gradients stages/pose_prior pipeline/view_report pipeline/pair
+stages.shared_error pipeline/inputs pipeline/guided pipeline/few_returns pipeline/fused
+stages.track stages/track_chain stages/inverse_variance stages/contradicted stages/misalignment pipeline/guided
+stages.triangulate stages/misalignment stages/inverse_variance stages/features stages/fuse
+transforms.adapters transforms/shown transforms/adapters transforms/dense_loader transforms/extend_depth test_clients
+transforms.collate transforms/adapters transforms/wrappers transforms/flagged_epoch transforms/extend_depth
+transforms.extend_depth transforms/flagged_epoch transforms/extend_depth transforms/adapters transforms/shown
+transforms.extend_depth transforms/same_inputs transforms/dense_loader
+transforms.kornia geometry/kornia
+transforms.layout transforms/extend_depth_stub transforms/adapters transforms/dense_loader
+transforms.maps integrations/lerobot_package extract/policy_columns stages/pose_prior
+transforms.poses pipeline/rig transforms/sample_spec transforms/kornia_samples
+transforms.sample_access transforms/adapters transforms/wrappers transforms/kornia_samples transforms/shown
+transforms.sample_access transforms/flagged_epoch
+transforms.sample_spec transforms/extend_depth_stub transforms/adapters transforms/wrappers transforms/shown
+transforms.schema transforms/wrappers transforms/adapters transforms/shown transforms/flagged_epoch
+transforms.status transforms/wrappers transforms/adapters transforms/shown transforms/flagged_epoch
+transforms.tokens ops/compiled transforms/extend_depth_stub transforms/shown transforms/wrappers
+transforms.tokens transforms/same_inputs
+validation.capture_check data/rlds extract/policy_columns cli/process_capture cli/inspect
+validation.edge_fault validation/capture_check cli/process_capture
+validation.edge_lag validation/capture_check cli/process_capture
+validation.evidence validation/wrong_causes runtime/numerics cli/validate_command
+validation.faults validation/capture_check extract/policy_columns
+validation.options validation/wrong_causes validation/validate
+validation.picture_field cli/scale_command cli/complete cli/process_capture
+validation.pose_check validation/capture_check extract/policy_columns
+validation.validate runtime/numerics cli/validate_command
+validation.wrong_causes validation/validate runtime/numerics
+viz.plots.axis viz/drawn_figures experiments/sweep_tables viz/viewer cli/pin_command cli/align_command
+viz.plots.canvas viz/drawn_figures viz/plots viz/viewer data/rlds cli/process_capture cli/align_command
+viz.plots.canvas cli/validate_command cli/pin_command
+viz.plots.colours viz/drawn_figures viz/viewer_cameras viz/plots viz/viewer cli/process_capture cli/validate_command
+viz.plots.document cli/pin_command cli/align_command cli/validate_command cli/scale_command viz/viewer_cameras
+viz.plots.maps viz/drawn_figures viz/viewer cli/align_command cli/process_capture cli/complete cli/validate_command
+viz.plots.markup experiments/sweep_tables viz/viewer cli/pin_command cli/align_command
+viz.plots.panel viz/drawn_figures viz/plots experiments/sweep_tables cli/pin_command cli/scale_command
+viz.plots.pictures viz/drawn_figures docs/report docs/report_page viz/viewer
+viz.plots.previews viz/drawn_figures cli/process_capture
+viz.plots.svg viz/drawn_figures viz/plots cli/pin_command robustness/resumed_outputs
+viz.plots.validation viz/drawn_figures viz/plots cli/validate_command
+viz.viewer.again viz/viewer
+viz.viewer.exhibit viz/viewer_cameras viz/viewer cli/process_capture
+viz.viewer.html viz/viewer cli/process_capture robustness/written_values
+viz.viewer.pin cli/pin_command
+viz.viewer.points viz/viewer cli/process_capture
+viz.viewer.validation cli/validate_command cli/align_command cli/scale_command
+"""
+
+TESTS: dict[str, list[str]] = defaultdict(list)
+for _module, *_files in (row.split() for row in _TABLE.strip().splitlines()):
+    TESTS[_module] += [f"tests/{name.replace('/', '/test_')}.py" for name in _files]
