@@ -300,7 +300,7 @@ transforms.extend_depth transforms/same_inputs transforms/dense_loader
 transforms.kornia geometry/kornia
 transforms.layout transforms/extend_depth_stub transforms/adapters transforms/dense_loader
 transforms.maps integrations/lerobot_package extract/policy_columns stages/pose_prior
-transforms.poses pipeline/rig transforms/sample_spec transforms/kornia_samples
+transforms.poses transforms/poses pipeline/rig transforms/sample_spec transforms/kornia_samples
 transforms.sample_access transforms/adapters transforms/wrappers transforms/kornia_samples transforms/shown
 transforms.sample_access transforms/flagged_epoch
 transforms.sample_spec transforms/extend_depth_stub transforms/adapters transforms/wrappers transforms/shown

@@ -39,6 +39,11 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     for row in (frame["aligned"] for frame in found["frames"]):
         assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
         assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
+    for frame in found["frames"]:
+        z, row = room.truth(frame["frame"])["depth"], frame["aligned"]
+        assert row["near"] / 256 == pytest.approx(float(((z > 0) & (z < 2)).double().mean()), abs=0.1)
+        assert 0 <= row["far"] <= 256 - row["near"]
+        assert frame["views"] == [frame["frame"] + k for k in (-2, -1, 1, 2) if 0 <= frame["frame"] + k < 6]
     again = data.open(out)
     truth = room.truth(3)["depth"]
     depth = again[1].depth

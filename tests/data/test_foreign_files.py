@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from dhtorch import data
 from dhtorch.cli import inspect
+from dhtorch.data import foreign_files
 from dhtorch.data.foreign_files import describe_foreign_file
 from dhtorch.data.io.decode import FormatError
 
@@ -57,3 +59,22 @@ def test_a_folder_of_arrays_alone_names_the_option_for_maps(tmp_path: Path) -> N
     (tmp_path / "00000.png").write_bytes(b"a picture")
     with pytest.raises(FormatError, match=r"found 00000\.npy, 00000\.png"):
         data.recognise(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "what"),
+    [
+        ([], "a video without depth"),
+        ([("COLOR", "V_MJPEG")], "a video without depth"),
+        (
+            [("COLOR", "V_MJPEG"), ("", "V_MS/VFW")],
+            "a video of the tracks COLOR, V_MS/VFW, none of which is called DEPTH",
+        ),
+    ],
+)
+def test_a_matroska_file_without_a_depth_track_is_described_by_its_tracks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tracks: list[tuple[str, str]], what: str
+) -> None:
+    found = [SimpleNamespace(name=name, codec=codec) for name, codec in tracks]
+    monkeypatch.setattr(foreign_files.matroska, "list_video_tracks", lambda _: found)
+    assert describe_foreign_file(tmp_path / "a.mkv").what == f"{what}; {foreign_files.NEEDS_DEPTH}"

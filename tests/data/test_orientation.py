@@ -263,3 +263,17 @@ def test_display_matrix_of_a_film_is_read_but_not_applied(tmp_path: Path, k: int
     header = video.read_video_header(tmp_path / "film.mp4")
     assert (header.display, header.hw) == (k, (32, 48))
     assert int(video.read_video_frame(tmp_path / "film.mp4", 0)[8, 8, 0]) > 200
+
+
+def test_an_edge_is_its_capped_strength_and_the_cosine_and_sine_of_twice_its_direction() -> None:
+    x = torch.rand(7, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x[:, 4:] += 9  # a step that the cap cuts
+    mask = torch.rand(7, 9, generator=torch.Generator().manual_seed(1)) < 0.8
+    gy, gx = np.gradient(x.numpy())
+    strength = np.hypot(gx, gy) * mask.numpy()
+    capped = np.minimum(strength, orientation._MAX_EDGE_STRENGTH * strength[mask.numpy()].mean())
+    assert (capped < strength).any()
+    angle = 2 * np.arctan2(gy, gx)
+    found = orientation._edge_vectors(x, mask)
+    np.testing.assert_allclose(found, [capped, capped * np.cos(angle), capped * np.sin(angle)], atol=1e-9)
+    assert not orientation._edge_vectors(x, mask & False).any()

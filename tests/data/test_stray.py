@@ -6,7 +6,8 @@ import os
 import pickle
 import shutil
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from support.stray_frames import DEPTH_HW, HW, camera_of, walk
 
 from dhtorch import data, pytree
 from dhtorch import testing as writers
+from dhtorch.data.clocks import FilmPairing
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import stray
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
@@ -439,3 +442,47 @@ def test_real_capture() -> None:
     agree, count = disagreement(a, b)
     assert agree < 0.02 and count > 40_000
     assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
+
+
+@pytest.mark.parametrize(
+    ("leads", "lost"),
+    [
+        ([0.06, 0.2], "last"),
+        ([-0.06, -0.2], "first"),
+        ([0.06, 0.05], None),
+        ([-0.06, -0.05], None),
+        ([0.2, -0.2], None),
+        ([0.2], None),
+        ([], None),
+    ],
+)
+def test_edges_decide_which_pictures_are_lost_where_all_lead_alike(
+    monkeypatch: pytest.MonkeyPatch, leads: list[float], lost: str | None
+) -> None:
+    pairings = [FilmPairing(np.arange(3) - k) for k in (0, 1, 2)]
+    monkeypatch.setattr(stray, "_edge_leads", lambda *_: np.array(leads))
+    load: Any = SimpleNamespace(video=Path("rgb.mp4"), root=Path("scan"))
+    if lost is None:
+        with pytest.raises(FormatError, match=r"rgb\.mp4: frames: found 2 pictures less than rows at a constant rate"):
+            stray._choose_pairing(load, pairings, -2, None)
+        return
+    pairing, choice = stray._choose_pairing(load, pairings, -2, None)
+    assert pairing is pairings[-1 if lost == "first" else 0]
+    assert choice == f"its {lost} frames are lost (by the edges of depth and image)"
+
+
+def test_a_pairing_is_stated_with_the_reason_for_it() -> None:
+    pairings, load = [FilmPairing(np.arange(3)), FilmPairing(np.arange(3) - 1)], cast("Any", None)
+    choose = stray._choose_pairing
+    assert choose(load, pairings, 1, None) == (pairings[0], "paired from the first on")
+    assert choose(load, pairings, 1, True) == (pairings[1], "its first frame is lost (option lost_first)")
+    assert choose(load, pairings, -1, False) == (pairings[0], "its last frame is lost (option lost_first)")
+    for speed, pace in (
+        (1.0, ""),
+        (1.019, ""),
+        (1.25, ", it plays 1.25 times as fast"),
+        (0.8, ", it plays 1.25 times as slow"),
+    ):
+        only = FilmPairing(np.arange(3), speed, by_stamps=True)
+        assert choose(load, [only], 0, None) == (only, f"paired by their time stamps{pace}")
+    assert choose(load, pairings[:1], 0, None) == (pairings[0], "")
