@@ -222,6 +222,8 @@ def test_the_guide_says_which_way_back():
     tilted = guide_pin(series(torch.tensor([[math.radians(2.0), 0.0, math.radians(-3.0), 0.0, 0.0, 0.0]])))
     assert "⤓ tilt down 2.00°" in tilted and "⟳ roll right 3.00°" in tilted
     assert guide_pin(series(torch.zeros(1, 6)))[0] == "in place"
+    unknown = series(torch.tensor([[0.0, 0.0, 0.0, 0.010, -0.002, -0.005]])).replace(metric=torch.tensor([False]))
+    assert guide_pin(unknown)[0] == "mainly ← left, by an unknown length"
 
 
 def test_the_guide_brings_a_camera_back():

@@ -260,3 +260,32 @@ def test_tracks_decide_where_they_are_decisive():
     scale = check_of(*sound, tracks=scores(0.9, 1.0, small, 0.3), factor=1.2)
     assert not scale.contradicts and scale.factor == 1.025**4
     assert check_of(*sound, factor=1.2).factor == 1.2
+
+
+@pytest.mark.parametrize(
+    ("factor", "gain", "better", "pairs", "found"),
+    [
+        (1.1, 1.16, 8, 8, 1.1),
+        (0.9, 1.16, 8, 8, 0.9),
+        (1.1, 1.14, 8, 8, 1.0),
+        (1.046, 1.16, 8, 8, 1.046),
+        (1.044, 1.16, 8, 8, 1.0),
+        (0.956, 1.16, 8, 8, 0.956),
+        (0.958, 1.16, 8, 8, 1.0),
+        (1.1, 1.16, 6, 8, 1.1),
+        (1.1, 1.16, 5, 8, 1.0),
+        (1.1, 1.16, pose_check._MIN_DECIDING_PAIRS - 1, pose_check._MIN_DECIDING_PAIRS - 1, 1.0),
+        (1.1, 1.16, pose_check._MIN_DECIDING_PAIRS, pose_check._MIN_DECIDING_PAIRS, 1.1),
+    ],
+)
+def test_a_factor_near_1_is_distinguishable_by_most_of_enough_pairs(monkeypatch, factor, gain, better, pairs, found):
+    monkeypatch.setattr(pose_check, "_FINE_FACTORS", (factor,))
+    other = PoseReading(PoseConvention(unit=factor))
+    flipped = PoseReading(PoseConvention("right_up_back"))
+    stated = torch.full((pairs + 1,), 0.2)
+    stated[pairs] = torch.nan  # a pair that the stated poses do not compare
+    scaled = torch.where(torch.arange(pairs + 1) < better, 0.15, 0.25)
+    median = torch.tensor([0.2 * gain / 1.16, 0.01, 0.2 / 1.16])
+    columns = torch.stack((stated, torch.full_like(stated, 0.01), scaled), 1)
+    assert other.is_small_factor and not flipped.is_small_factor
+    assert pose_check._distinguishable_factor([NONE, flipped, other], median, columns) == pytest.approx(found)
