@@ -1,0 +1,233 @@
+"""Answers to fixed problems are those stored in ``stored_answers.json``, in double precision to six digits.
+
+Whatever changes a number of the method changes one here, however small. Other tests say whether an answer is right.
+Parts that compute in single precision (windows, cost volumes) depend on the processor's vectors: to a hundredth.
+
+python tests/test_stored_answers.py      write the file anew, after a change of answers that is meant
+"""
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))  # as a command
+
+import test_contract
+from support import digests
+from support.random_answers import random_points
+from support.room_models import room_model, room_scene
+
+from dhtorch import CameraPin, align_depth, complete_depth, validate_depth
+from dhtorch.alignment.references import collect_references
+from dhtorch.calibration.score_calibration import fit_calibration
+from dhtorch.codes import Source
+from dhtorch.data.recording import Recording
+from dhtorch.geometry.coarse_flow import coarse_flow
+from dhtorch.integrate import DepthView, extract_mesh, extract_points, fuse_views, make_volume
+from dhtorch.measure import metric_scale
+from dhtorch.metrics import errors, reliability, risk
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, WINDOW
+from dhtorch.pytree import collate, stack
+from dhtorch.synthetic import SyntheticRoom, depth_faults
+from dhtorch.validation.capture_check import check_capture
+from dhtorch.validation.faults import diagnose
+
+FILE = Path(__file__).with_name("stored_answers.json")
+
+#: Where returns end, m.
+NEAR_M = 2.0
+
+
+@cache
+def room():
+    return SyntheticRoom(n_frames=8, hw=(120, 160), depth_hw=(60, 80), supersample=1, step_m=0.05, seed=3)
+
+
+@cache
+def frame(k):
+    """A frame in double precision whose returns end at two metres."""
+    return range_split(room()[k], NEAR_M).to(torch.float64)
+
+
+@cache
+def answer(name):
+    """A pair, or a reference with several source views, by each method."""
+    methods = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO, "fused": FUSED}
+    method = methods[name].replace(n=256)
+    trace = {}
+    views = frame(4) if method.views == 1 else stack([frame(k) for k in (1, 2, 5, 7)])
+    with torch.no_grad():
+        estimate = method(frame(1) if method.views == 1 else frame(3), views, seed=2, trace=trace)
+    return estimate, trace
+
+
+def pair(name):
+    estimate, trace = answer(name)
+    kept = {key: trace[key] for key in ("samples", "tracks", "fit") if key in trace}
+    return {"estimate": estimate, **kept}
+
+
+def batch_of_pairs():
+    with torch.no_grad():
+        return MAP.replace(n=128)(collate([frame(1), frame(2)]), collate([frame(4), frame(5)]), seed=1)
+
+
+def truth(k):
+    return room().truth(k)["depth"].to(torch.float64)
+
+
+def dense(**options):
+    with torch.no_grad():
+        return complete_depth(frame(3), stack([frame(1), frame(6)]), method=MAP.replace(n=256), seed=1, **options)
+
+
+def validated(scale, **options):
+    with torch.no_grad():
+        return validate_depth(
+            scale * truth(3), frame(3), stack([frame(1), frame(6)]), method=MAP.replace(n=256), size=120, **options
+        )
+
+
+def aligned(kind, fault):
+    estimate, trace = answer("map")
+    spoilt, _ = depth_faults.apply_fault(fault, truth(1))
+    trace_of = {}
+    with torch.no_grad():
+        result = align_depth(
+            1 / spoilt if kind == "inverse" else spoilt, [trace["samples"], estimate], kind=kind, trace=trace_of
+        )
+    return result, trace_of
+
+
+def mapped():
+    """A volume of three views, its points and its mesh."""
+    volume = make_volume(0.08, truncation=0.25, channels=3)
+    for k, source in ((0, Source.SENSOR), (2, Source.RECOVERED), (5, Source.SWEPT)):
+        view = room()[k]
+        z = truth(k)[:, ::2, ::2].float()
+        sigma = 0.01 + 0.005 * z**2
+        colour = (view.image / 255)[:, :, ::2, ::2].movedim(1, -1)
+        camera = view.camera.map(lambda x: x / 2)
+        volume = fuse_views(volume, DepthView(z, sigma, colour, camera, room().poses[k : k + 1]), source=source)
+    return extract_points(volume), extract_mesh(volume)
+
+
+def metrics_of_points():
+    points = [random_points(300, seed) for seed in range(3)]
+    pooled = collate(points)
+    return {
+        "errors": errors.measure_errors(pooled),
+        "risk": risk.measure_risk(pooled),
+        "curve": risk.risk_coverage(pooled),
+        "ece": reliability.excess_ece(pooled, seed=0),
+        "reliability": reliability.measure_reliability(points),
+        "calibration": fit_calibration(points),
+    }
+
+
+def measured():
+    """The metric size of a model of the room."""
+    model, _ = room_model("maps", "bend", 0.02)
+    names = [view.name for view in model.views]
+    return metric_scale(model, room_scene().frames, names=names, cutoff=2.5)
+
+
+def pinned():
+    with torch.no_grad():
+        return CameraPin(room()[2], seed=1).check(torch.cat([room()[k].image for k in (2, 3)]))
+
+
+def checked():
+    frames = [room()[k] for k in range(8)]
+    recording = Recording("room", "synthetic", frames.__getitem__, torch.arange(8), poses=room().poses)
+    return check_capture(recording)
+
+
+def flow():
+    images = [room()[k].image.double() / 255 for k in (1, 4)]
+    return {f"{h}x{w}": coarse_flow(*(x[..., :h, :w] for x in images)) for h, w in ((120, 160), (75, 101))}
+
+
+PROBLEMS = {
+    **{f"pair {name}": lambda name=name: pair(name) for name in ("paper", "kornia", "map", "window", "auto", "fused")},
+    "batch of pairs": batch_of_pairs,
+    "complete": lambda: dense(size=160, planes=32),
+    "complete, two refinements and a small map": lambda: dense(size=96, planes=24, refinements=1, source_views=1),
+    "validate a sound map": lambda: validated(1.0),
+    "validate a map that is too long": lambda: validated(1.06, views=False),
+    "references": lambda: collect_references(truth(1), [answer("map")[1]["samples"], answer("map")[0]], (120, 160)),
+    "align metric": lambda: aligned("metric", "tilt"),
+    "align scale": lambda: aligned("scale", "scale_short"),
+    "align affine": lambda: aligned("affine", "shift"),
+    "align inverse": lambda: aligned("inverse", "scale_short"),
+    "diagnose": lambda: diagnose([room()[k] for k in range(8)], [1000 * truth(k).float() for k in range(8)], seed=1),
+    "check a capture": checked,
+    "map": mapped,
+    "metrics": metrics_of_points,
+    "coarse flow": flow,
+    "scale of a model": measured,
+    "pinned camera": pinned,
+}
+
+
+def calls():
+    """A call of every public function that the contract has a row of, in double precision."""
+    found = {}
+    for row in test_contract.ROWS:
+        name = f"{row.fn.__module__.rsplit('.', 1)[-1]}.{row.fn.__name__}"
+        name = name if name not in found else f"{name}, {sum(k.startswith(name) for k in found) + 1}"
+        found[name] = lambda row=row: row.fn(*row.make(2, 7, torch.float64))
+    return found
+
+
+PROBLEMS |= calls()
+
+
+#: Differences allowed, by the beginnings of names, where a part computes in single precision.
+TOLERANCES = {
+    **dict.fromkeys(("pair window", "pair auto", "pair fused", "batch", "complete", "validate", "align affine"), 0.01),
+    **dict.fromkeys(("diagnose", "check"), 0.01),
+    **{"pair": 1e-4, "references": 1e-4, "align": 1e-3},
+}
+
+
+def found(name):
+    torch.manual_seed(0)  # of functions that draw without a generator of their own
+    with torch.no_grad():
+        return digests.digest(PROBLEMS[name]())
+
+
+STORED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+
+
+def test_every_problem_is_stored():
+    assert list(STORED) == list(PROBLEMS)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_an_answer_is_the_one_that_is_stored(name):
+    tolerance = next((limit for start, limit in TOLERANCES.items() if name.startswith(start)), digests.TOLERANCE)
+    wrong = digests.differences(found(name), STORED[name], tolerance)
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_changed_answer_is_noticed():
+    x = torch.rand(40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    one = digests.digest({"depth": x, "name": "a"})
+    assert not digests.differences(digests.digest({"depth": x * (1 + 1e-8), "name": "a"}), one)
+    for other in (x * (1 + 1e-5), x.flip(0), x.where(x < 0.9, torch.nan), x[:, None]):
+        assert len(digests.differences(digests.digest({"depth": other, "name": "a"}), one)) == 1
+    assert len(digests.differences(digests.digest({"depth": x, "name": "b"}), one)) == 1
+    assert len(digests.differences(digests.digest({"depth": x}), one)) == 1
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    names = [name for name in PROBLEMS if not sys.argv[1:] or name in sys.argv[1:]]
+    stored = STORED | {name: found(name) for name in names}
+    FILE.write_text(json.dumps({name: stored[name] for name in PROBLEMS}, indent=1) + "\n", encoding="utf-8")
