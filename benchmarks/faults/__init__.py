@@ -41,7 +41,7 @@ _STORED |= {"pipeline", "records", "stages", "validation", "experiments"}
 
 
 def _tests_of(module: str) -> list[str]:
-    stored = ["tests/test_stored_answers.py"] if module.split(".")[0] in _STORED else []
+    stored = ["tests/test_stored_answers.py"] if module.split(".", maxsplit=1)[0] in _STORED else []
     return list(dict.fromkeys([*_NAMED.get(module, []), *stored, *covering.TESTS.get(module, [])]))
 
 
