@@ -230,4 +230,4 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     names = [name for name in PROBLEMS if not sys.argv[1:] or name in sys.argv[1:]]
     stored = STORED | {name: found(name) for name in names}
-    FILE.write_text(json.dumps({name: stored[name] for name in PROBLEMS}, indent=1) + "\n", encoding="utf-8")
+    FILE.write_text(digests.dump({name: stored[name] for name in PROBLEMS}), encoding="utf-8")

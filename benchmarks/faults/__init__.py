@@ -35,14 +35,18 @@ FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
 
 _NAMED: dict[str, list[str]] = {module: tests for part in PARTS for module, tests in part.TESTS.items()}
 
-#: Packages whose answers are stored.
-_STORED = {"alignment", "calibration", "geometry", "integrate", "measure", "metrics"}
-_STORED |= {"pipeline", "records", "stages", "validation", "experiments"}
+#: Tests that hold answers, readings and figures against stored ones, by package.
+_STORED = dict.fromkeys(
+    ("alignment", "calibration", "geometry", "integrate", "measure", "metrics"), "test_stored_answers"
+)
+_STORED |= dict.fromkeys(("pipeline", "records", "stages", "validation", "experiments"), "test_stored_answers")
+_STORED |= {"data": "data/test_stored_readings", "viz": "viz/test_drawn_figures"}
 
 
 def _tests_of(module: str) -> list[str]:
-    stored = ["tests/test_stored_answers.py"] if module.split(".", maxsplit=1)[0] in _STORED else []
-    return list(dict.fromkeys([*_NAMED.get(module, []), *stored, *covering.TESTS.get(module, [])]))
+    stored = _STORED.get(module.split(".", maxsplit=1)[0])
+    own = [*_NAMED.get(module, []), *([f"tests/{stored}.py"] if stored else [])]
+    return list(dict.fromkeys([*own, *covering.TESTS.get(module, [])]))
 
 
 #: Module → the tests that are to notice: its own, then others that run its lines.

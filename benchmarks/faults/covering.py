@@ -30,7 +30,7 @@ cli.enrich_card cli/captures_without_depth extract/policy_columns test_clients c
 cli.enrich_page cli/enrich extract/enrich_guarantees
 cli.errors cli/captures_without_depth cli/fetch cli/exit cli/resume cli/pin_command
 cli.fetch cli/fetch
-cli.inspect viz/drawn_figures cli/inspect cli/option_checks data/rlds data/lerobot
+cli.inspect data/stored_readings viz/drawn_figures cli/inspect cli/option_checks data/rlds data/lerobot
 cli.job cli/resume cli/output cli/inspect
 cli.layouts cli/complete cli/align_command cli/process_capture
 cli.option_checks cli/exit cli/option_checks test_settings cli/resume cli/captures_without_depth cli/align_command

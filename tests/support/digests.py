@@ -1,7 +1,9 @@
 """Records, arrays and numbers as short lists of numbers that are compared with a tolerance."""
 
 import dataclasses
+import json
 import math
+import re
 
 import numpy as np
 import torch
@@ -11,6 +13,8 @@ TOLERANCE = 1e-6
 
 #: Mean size of a leaf below which its numbers are rounding errors.
 MIN_SIZE = 1e-6
+
+_NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
 
 
 def digest(value, path="", out=None):
@@ -46,7 +50,24 @@ def summary(value):
     n = max(int(finite.sum()), 1)
     waves = [np.ones_like(x), np.cos(0.7 * place), np.sin(0.013 * place)]
     means = [float((x * w).sum() / n) for w in waves]
-    return [list(array.shape), int(finite.sum()), float(np.abs(x).sum() / n), *means]
+    numbers = [float(np.abs(x).sum() / n), *means]
+    return [list(array.shape), int(finite.sum()), *(float(f"{number:.10g}") for number in numbers)]
+
+
+def alike(a, b, absolute, relative):
+    """Whether two lines of text differ in numbers alone, and in these by no more than stated."""
+    x, y = ([float(n) for n in _NUMBER.findall(line)] for line in (a, b))
+    return a == b or (_NUMBER.sub("#", a) == _NUMBER.sub("#", b) and np.allclose(x, y, atol=absolute, rtol=relative))
+
+
+def dump(value):
+    """JSON text with a line for every leaf."""
+    text = json.dumps(value, indent=1, ensure_ascii=False)
+    for _ in range(2):  # shapes, then the lists that hold them
+        text = re.sub(
+            r"\[\s+([^\[\]{}\"]*(?:\[[^\[\]]*\][^\[\]{}\"]*)?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text
+        )
+    return f"{text}\n"
 
 
 def differences(found, stored, tolerance=TOLERANCE):

@@ -3,16 +3,14 @@
 Without layout: places that depend on the size of letters (legends, ticks that matplotlib places) are left out.
 """
 
-import re
-
 import numpy as np
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from support.digests import alike
+
 #: Difference of two numbers of a line that counts as none: absolute (points, grey values), and relative.
 TOLERANCE, TOLERANCE_REL = 0.06, 2e-3
-
-_NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
 
 
 def figures_of(call, monkeypatch):
@@ -42,17 +40,10 @@ def describe(figure):
 
 def differences(found, stored):
     """Lines that differ by more than the tolerance, as a text; empty where none does."""
-    wrong = [f"- {b}\n+ {a}" for a, b in zip(found, stored, strict=False) if not _same(a, b)]
+    wrong = [f"- {b}\n+ {a}" for a, b in zip(found, stored, strict=False) if not alike(a, b, TOLERANCE, TOLERANCE_REL)]
     if len(found) != len(stored):
         wrong.append(f"{len(found)} lines, stored are {len(stored)}")
     return "\n".join(wrong)
-
-
-def _same(a, b):
-    if a == b:
-        return True
-    x, y = ([float(n) for n in _NUMBER.findall(line)] for line in (a, b))
-    return _NUMBER.sub("#", a) == _NUMBER.sub("#", b) and np.allclose(x, y, atol=TOLERANCE, rtol=TOLERANCE_REL)
 
 
 def summarise(values):
