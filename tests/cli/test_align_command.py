@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from support import stored_outputs
 
 from dhtorch import data
 from dhtorch.cli import run
@@ -32,7 +33,9 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     out = tmp_path / "out"
     asked = ["align", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="no_answer>0.9"']
     assert run.main(asked) == run.EXIT_DONE
-    assert "2 maps" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "2 maps" in printed
+    stored_outputs.check("align", tmp_path, printed=printed.replace(str(maps), "MAPS"), folder=out)
     found = json.loads((out / "align.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
     assert found["whole"]["limited"]["unaligned"] == 0

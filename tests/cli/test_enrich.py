@@ -14,6 +14,7 @@ pytest.importorskip("av")
 
 from PIL import Image
 from pyarrow import parquet
+from support import stored_outputs
 from support.dataset_folders import decode_map, read_files, read_rows
 
 from dhtorch import data
@@ -254,6 +255,7 @@ def test_one_episode_of_an_older_set_is_counted_from_0_in_its_own_version(shots,
 def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     folder = tmp_path / "room"
     assert main(["enrich", "out=" + str(folder), "data=synthetic", "data.hw=[48,64]", "data.n_frames=3", *ASKED]) == 0
+    stored_outputs.check("enrich", tmp_path, printed=capsys.readouterr().out, folder=folder)
     found = read_rows(folder)
     assert [row["frame_index"] for row in found] == [0, 1, 2]
     assert np.array(Image.open(io.BytesIO(found[0]["observation.images.camera"]["bytes"]))).shape == (*HW, 3)

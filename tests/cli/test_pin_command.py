@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from support import stored_outputs
 from support.rooms import moved_camera_capture
 
 from dhtorch.cli import pin, run
@@ -33,6 +34,7 @@ def test_an_episode_has_its_change_point_and_exceeds_its_limit(tmp_path, capture
     assert episode["verdict"] == "moved" and [change["frame"] for change in episode["changes"]] == [4]
     assert [row["verdict"] for row in episode["pictures"][:4]] == ["not_moved"] * 4
     shown = capsys.readouterr().out
+    stored_outputs.check("pin", root, printed=shown.replace(str(tmp_path), "ROOT"), folder=tmp_path / "out")
     assert "exceeded: moved is" in shown and "from frame 4 by" in shown
     page = (tmp_path / "out" / "pin.html").read_text()
     assert page.count("data:image/png") == 2 and "<svg" in page and "moved" in page

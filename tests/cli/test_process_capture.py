@@ -9,6 +9,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from support import stored_outputs
 
 from dhtorch import testing as writers
 from dhtorch.cli.completed_folder import count_estimated
@@ -56,6 +57,10 @@ def test_one_word_makes_maps_a_map_a_page_and_a_picture(made):
     assert b"comment up " in (made / "map.ply").read_bytes()[:2000]
     width, height = Image.open(made / "overview.png").size
     assert width >= 1600 and height > 600, "a row for each of three frames"
+
+
+def test_what_the_command_writes_is_stored(made):
+    stored_outputs.check("recover", made.parent, folder=made)
 
 
 def test_every_frame_has_a_preview_and_all_frames_are_in_the_video(made):

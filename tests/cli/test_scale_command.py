@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from support import stored_outputs
 
 from dhtorch.cli import run
 from dhtorch.measure import read_model
@@ -36,7 +37,9 @@ def test_a_model_is_written_in_metres(capture, model, capsys):
     assert report["U"]["low"] < true < report["U"]["high"] and len(report["frames"]) == 12
     before, after = read_model(folder), read_model(out)
     np.testing.assert_allclose(after.xyz, report["scale"] * before.xyz, rtol=1e-6)
-    assert "1 unit = " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "1 unit = " in printed
+    stored_outputs.check("scale", folder.parent, printed=printed.replace(str(capture), "CAPTURE"), folder=out)
     assert (out / "scale.html").read_text().count("data:image/png;base64,") == 3
 
 

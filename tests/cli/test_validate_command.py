@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from support import stored_outputs
 from support.sample_dicts import SIDE, frames
 from torch.utils.data import DataLoader
 
@@ -55,10 +56,11 @@ def validated(out, *words, capsys=None):
     return code, json.loads((out / "validate.json").read_text())
 
 
-def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
+def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps, capsys):
     out = tmp_path / "out"
     code, found = validated(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
     assert code == run.EXIT_SOME_FAILED, "metres read as millimetres"
+    stored_outputs.check("validate", tmp_path, printed=capsys.readouterr().out, folder=out)
     assert len(found["exceeded"]) == 1
     assert found["whole"]["limited"]["scale"] == pytest.approx(0.999, abs=0.002)
     assert [row["frame"] for row in found["frames"]] == [0, 3]

@@ -11,6 +11,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
+from support import stored_outputs
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -62,6 +63,10 @@ def test_every_file_is_written_and_named(job):
         assert words in said
     newest = max((folder / "synthetic_room").rglob("*.*"), key=lambda p: p.stat().st_mtime_ns)
     assert (folder / "result.json").stat().st_mtime_ns >= newest.stat().st_mtime_ns, "written last"
+
+
+def test_what_the_command_prints_and_writes_is_stored(job):
+    stored_outputs.check("integrate", job[0], printed=job[1], folder=job[0])
 
 
 def test_the_result_counts_what_was_widened(job):

@@ -26,6 +26,7 @@ import av
 from PIL import Image
 from pyarrow import parquet
 from support import known_episodes as known
+from support import stored_outputs
 from support.known_episodes import CAMERAS, FPS, HW, LENGTHS, LENS, TASKS
 
 from dhtorch import testing as writers
@@ -310,6 +311,10 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = [*FEW, "planes=8", "refinements=1", "steps=[30]", "figures=false", "points=all", "arrays=true"]
     assert main(["complete", str(root / "source"), f"out={root / 'out'}", *words, "format=frames"]) == 0
     return root / "out"
+
+
+def test_what_complete_writes_is_stored(completed: Path) -> None:
+    stored_outputs.check("complete", completed.parent, folder=completed)
 
 
 def test_complete_writes_the_numbers_of_every_frame(completed: Path) -> None:

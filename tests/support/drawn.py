@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from support.digests import alike
 
 #: Difference of two numbers of a line that counts as none: absolute (points, grey values), and relative.
-TOLERANCE, TOLERANCE_REL = 0.06, 2e-3
+TOLERANCE, TOLERANCE_REL = 0.006, 1e-3
 
 
 def figures_of(call, monkeypatch):
@@ -57,7 +57,7 @@ def summarise(values):
 
 
 def _numbers(values):
-    return " ".join(f"{v + 0.0:.2f}" for v in np.asarray(values, np.float64).ravel())
+    return " ".join(f"{v + 0.0:.3f}" for v in np.asarray(values, np.float64).ravel())
 
 
 def _colour(colour):

@@ -197,8 +197,8 @@ def test_a_figure_shows_what_is_stored(found, name):
 
 def test_a_changed_figure_is_noticed():
     lines = ["  Text 1.00 2.00 'a' 10 normal", "image 3x4 0.51"]
-    assert not drawn.differences(["  Text 1.04 2.00 'a' 10 normal", lines[1]], lines)
-    assert drawn.differences(["  Text 1.10 2.00 'a' 10 normal", lines[1]], lines).count("\n") == 1
+    assert not drawn.differences(["  Text 1.004 2.00 'a' 10 normal", lines[1]], lines)
+    assert drawn.differences(["  Text 1.010 2.00 'a' 10 normal", lines[1]], lines).count("\n") == 1
     assert drawn.differences(["  Text 1.00 2.00 'b' 10 normal", lines[1]], lines)
     assert drawn.differences(lines[:1], lines) == "1 lines, stored are 2"
     one, other = np.zeros((4, 5)), np.zeros((4, 5))
