@@ -80,7 +80,8 @@ data.depth_maps cli/validate_command cli/align_command robustness/damaged_files
 data.foreign_files data/foreign_files data/azure_kinect data/record3d data/readers cli/captures_without_depth
 data.foreign_files cli/inspect
 data.intrinsics data/tum data/rlds data/lerobot data/azure_kinect data/readers
-data.io.decode data/decompression_bombs data/posed_images data/orientation cli/pin_command data/plausibility data/image_folders data/tum
+data.io.decode data/decompression_bombs data/posed_images data/orientation cli/pin_command data/plausibility
+data.io.decode data/image_folders data/tum
 data.io.decode data/decompression_bombs data/corrections
 data.io.safe_open data/tum data/rh20t data/ca1m data/readers data/simulator_hdf5
 data.laser data/ca1m data/arkitscenes robustness/damaged_files
