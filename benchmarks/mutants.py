@@ -34,12 +34,14 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, thread
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from faults import FAULTS, TESTS
+from faults.equivalents import EQUIVALENT
 from faults.rows import Fault
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -315,6 +317,12 @@ def by_rule(source: str, module: str) -> Iterator[Fault]:
                 old, changed = _around(flat, statement, a, b, new)
                 if inside.count(old) == 1 and old != changed:
                     yield Fault(module, function, old, changed)
+
+
+def known_equivalent(fault: Fault) -> Fault:
+    """The fault, with the reason why it changes no answer where one is listed."""
+    reason = EQUIVALENT.get((fault.module, fault.function, fault.old, fault.new), "")
+    return replace(fault, equivalent=reason) if reason else fault
 
 
 def _is_code(path: Path, fault: Fault) -> bool:
@@ -730,7 +738,7 @@ def main() -> int:
     if args.sweep:
         drawn = [f for m in wanted if m in TESTS for f in by_rule(known[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
-        faults = [fault for fault in faults if _is_code(known[fault.module], fault)]
+        faults = [known_equivalent(fault) for fault in faults if _is_code(known[fault.module], fault)]
     else:
         home = [(module_of(f.module, known), f) for f in FAULTS]
         faults = [f for m in wanted for f in [f for place, f in home if place == m][:: args.every]]
@@ -741,7 +749,7 @@ def main() -> int:
     home = [(module_of(fault.module, known), fault) for fault in faults]
     faults = [f for m, f in home if named.get(m) and (m, f.function, f.old, f.new) not in done]
     for row in run(faults, named, args.tests, args.jobs, args.quiet):
-        rows.append(row)
+        rows.append(row | {"seed": args.seed} if args.sweep else row)
         if args.json:  # at once: what was tried in an hour is not lost with the next
             sure = [row for row in rows if not (args.among or args.keyword) or row["verdict"] == "caught"]
             so_far = rows if args.sweep else joined(before, sure)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pickle
 import sqlite3
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from dhtorch import data
 from dhtorch.data.codecs import ros_images, rosbag1
 from dhtorch.data.codecs.ros_messages import CameraInfo, Header, RawImage
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import rosbag_index
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -434,3 +437,16 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) ->
         decompress_chunk(b"\0" * 40, "lz4", 1 << 29, tmp_path)
     with pytest.raises(FormatError, match="compression: found snappy"):
         decompress_chunk(b"", "snappy", 10, tmp_path)
+
+
+def test_topics_of_other_types_are_named_by_type_or_coding() -> None:
+    bag = rosbag_index.BagIndex(Path("a.bag"))
+    for name, kind, coding in (
+        ("/joy", "sensor_msgs/Joy", "ros1"),
+        ("/joy", "sensor_msgs/Joy", "ros1"),
+        ("/x", "", "json"),
+    ):
+        message: Any = SimpleNamespace(topic=SimpleNamespace(name=name, type=kind, coding=coding))
+        rosbag_index._add_message(bag, message)
+    assert bag.others == {"/joy (sensor_msgs/Joy)": 2, "/x (json)": 1}
+    assert bag.format_topics() == "/joy (sensor_msgs/Joy), /x (json)"
