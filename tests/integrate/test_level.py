@@ -36,6 +36,14 @@ def test_a_floor_is_found():
     assert _fit_floor_normal(level_floor()[:50], up / up.norm(), 0.02) is None, "of few points none is believed"
 
 
+def test_a_plane_of_less_than_a_tenth_of_the_points_is_no_floor():
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    cloud = 4 * torch.rand(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    for n, is_floor in ((300, False), (700, True)):
+        floor = torch.cat((cloud, level_floor()[:n]))
+        assert (_fit_floor_normal(floor, up, 0.02) is not None) == is_floor, n
+
+
 @pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
 def test_a_door_is_no_floor_far_from_the_guess():
     frame = data.open(Path(os.environ["DHTORCH_DATA"]) / "r3d_door")[0]

@@ -22,6 +22,7 @@ from dhtorch.transforms import (
     SampleError,
     SampleProblem,
     ValidateDepth,
+    adapters,
     collate_kept,
     one_thread,
 )
@@ -427,3 +428,18 @@ def test_the_prefix_that_lerobots_processors_keep():
     out = tiny(prefix="observation.dh_")(tiny_sample())
     kept = {k for k in out if k.startswith("observation.")}
     assert len(kept) == len(tiny()(tiny_sample()).keys() - tiny_sample().keys()) == 17
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_a_gap_adds_the_earlier_picture_its_mark_and_its_pose(posed, monkeypatch):
+    monkeypatch.setattr(adapters, "_resolve_unit", lambda transform, _: transform)
+    views = SimpleNamespace(image="image", other_image="earlier", pose="T", other_pose="T_earlier" if posed else None)
+    items = [{"image": f"picture {k}", "T": f"pose {k}", "episode": k // 3} for k in range(5)]
+    views.keys = lambda: ("image",)
+    transform = SimpleNamespace(views=views, on_error="raise", batched=False)
+    data = ExtendedDataset(items, transform, gap=2, episode_key="episode")
+    for k, (source, is_pad) in enumerate([(0, True), (1, True), (0, False), (3, True), (4, True)]):
+        found = data._load(k)
+        assert found.pop("earlier_is_pad").tolist() == [is_pad]
+        added = {"earlier": f"picture {source}"} | ({"T_earlier": f"pose {source}"} if posed else {})
+        assert found == items[k] | added
