@@ -676,6 +676,16 @@ def caught() -> str:
     return table(["faults planted in", "caught", "change no answer"], cells)
 
 
+def caught_by_rule() -> str:
+    """Faults that rules drew and a test caught, of those that change an answer."""
+    rows = read_json(RESULTS / "mutants_sweep.json")
+    _, n, of, same = mutants.by_module(rows)[-1]
+    return table(
+        ["faults drawn with the seed", "caught", "share", "change no answer"],
+        [[f"`{rows[0]['seed']}`", f"{n} of {of}", f"{n / of:.0%}", f"{same}"]],
+    )
+
+
 def lerobot_trained() -> str:
     """Commands of LeRobot by set and version: passed, failed and why, or not run."""
     file = RESULTS / "lerobot_train.json"
@@ -763,7 +773,10 @@ TABLES |= {
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
-    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
+    {"speed": speed_tables.stages, "mutants": caught, "mutants by rule": caught_by_rule}
+    | speed_tables.TABLES
+    | beside_kornia.TABLES
+    | pose_tables.TABLES
 )
 TABLES |= kornia_adapters.TABLES | learning_tables.TABLES | reader_tables.TABLES | client_tables.TABLES
 TABLES |= {

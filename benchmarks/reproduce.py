@@ -115,6 +115,7 @@ SCRIPTS |= {
     "sensitivity": "",
     "capture_faults": "",
     "mutants": "--quiet",
+    "mutants_sweep": "--sweep 0.0025 --seed COMMIT",  # the first eight digits of the commit that is measured
     "kornia": "--clock cpu",
     "kornia_adapters": "",
     "xfeat_noise": "",
@@ -155,6 +156,7 @@ NAMED = {
     "first_picture": "captures",
     "kornia": "beside_kornia",
     "loader_workers0": "loader",
+    "mutants_sweep": "mutants",
     "dense_speed": "dense",
     "clients": "clients/all",
     **{name: f"clients/{name}" for name in ("readers_3d", "tiny_field", "lerobot_train", "lerobot_plugin")},

@@ -19,7 +19,8 @@ from dhtorch.data.codecs import lzfse as codec_lzfse
 from dhtorch.data.codecs import mp4 as codec_mp4
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.decode import FormatError, resolve_inside
+from dhtorch.data.readers import lerobot_meta
 from dhtorch.testing.mp4 import write_video
 
 lzfse = pytest.importorskip("lzfse")
@@ -306,3 +307,19 @@ def test_a_few_decoders_stay_open(tmp_path: Path) -> None:
     assert held() == 8
     codec_video.close_videos()
     assert held() == 0
+
+
+@pytest.mark.parametrize("name", ["", "a\0b", "x" * 1001, "/etc/passwd", "../a.png", "a/../../b.png"])
+def test_a_name_that_leads_out_of_the_capture_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"file_path: found .*expected a file inside the capture"):
+        resolve_inside(tmp_path, name, tmp_path / "a.json", "file_path")
+    assert resolve_inside(tmp_path, "a/b.png", tmp_path / "a.json", "file_path") == tmp_path / "a" / "b.png"
+    assert resolve_inside(tmp_path, "x" * 1000, tmp_path / "a.json", "file_path") == tmp_path / ("x" * 1000)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 1.5, 10.0, float("nan")])
+def test_counts_are_whole_numbers_below_a_limit(wrong: float, tmp_path: Path) -> None:
+    good = np.array([0.0, 9.0])
+    assert lerobot_meta._check_counts(good, tmp_path / "a.parquet", "length", 10).tolist() == [0, 9]
+    with pytest.raises(FormatError, match=f"length: found {wrong}, expected a count"):
+        lerobot_meta._check_counts(np.array([0.0, wrong]), tmp_path / "a.parquet", "length", 10)
