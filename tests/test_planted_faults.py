@@ -11,6 +11,7 @@ sys.path.append(str(REPO / "benchmarks"))
 
 import mutants  # noqa: E402
 from faults import FAULTS, PARTS, TESTS  # noqa: E402
+from faults.equivalents import EQUIVALENT  # noqa: E402
 from faults.rows import Fault  # noqa: E402
 
 KNOWN = mutants.modules()
@@ -23,6 +24,12 @@ def test_every_fault_fits_the_code_once(module):
         if fault.module == module:
             mutants.planted(source, fault)
             assert fault.old != fault.new, fault
+
+
+def test_every_change_that_is_listed_as_equivalent_is_one_that_the_rules_give():
+    for module in {key[0] for key in EQUIVALENT}:
+        given = {(f.module, f.function, f.old, f.new) for f in mutants.by_rule(KNOWN[module].read_text(), module)}
+        assert {key for key in EQUIVALENT if key[0] == module} <= given, module
 
 
 def test_no_fault_is_planted_twice_and_no_table_hides_another():

@@ -35,7 +35,7 @@ FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
 
 _NAMED: dict[str, list[str]] = {module: tests for part in PARTS for module, tests in part.TESTS.items()}
 
-#: Tests that hold answers, readings and figures against stored ones, by package.
+#: Tests that compare answers, readings and figures with stored ones, by package.
 _STORED = dict.fromkeys(
     ("alignment", "calibration", "geometry", "integrate", "measure", "metrics"), "test_stored_answers"
 )

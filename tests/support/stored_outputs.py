@@ -17,7 +17,7 @@ ABSOLUTE, RELATIVE = 0.06, 0.1
 
 #: What differs from run to run: times, dates, keys, versions, and what a machine is.
 CHANGING = re.compile(
-    r"^git$|meta$|seal|elapsed|seconds|date|time_|_time$|key|digest|version|commit|threads|operators|created|peak"
+    r"^git$|meta$|seal|elapsed|seconds|(^|_)date|time_|_time$|key|digest|version|commit|threads|operators|created|peak"
 )
 
 
