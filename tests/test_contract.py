@@ -985,6 +985,38 @@ def test_wrong_shapes_raise(row):
         row.fn(*row.bad(args))
 
 
+#: Function -> positions of arguments that may have another batch size: without use, with leading axes of any number, or
+#: not checked before another function.
+OTHER_BATCH = {
+    pose.pnp_ransac: (2,),
+    pose_prior.check_pose_prior: (3,),
+    reprojection_problem.whitened_residuals: (0, 1),
+    reprojection_problem.squared_residuals: (0, 1),
+    track_chain.track_chain: (0, 1),
+} | dict.fromkeys((score.confidence, score.confidence_from_error, score.confidence_from_sigma), (3,))
+OTHER_BATCH |= dict.fromkeys((probe.join_moments, probe.solve_ridge, probe.predict_targets), (0, 1))
+
+
+@named("raises")
+def test_another_batch_in_one_argument_raises(row):
+    args = row.make(2, 9, torch.float32)
+    batched = [k for k, a in enumerate(args) if any(v.shape[:1] == (2,) for v in leaves(a)) and k not in row.shared]
+    for position in batched if len(batched) > 1 else ():
+        if position not in OTHER_BATCH.get(inspect.unwrap(row.fn), ()):
+            longer = tensor_map(lambda v: torch.cat((v, v[:1])) if v.shape[:1] == (2,) else v, args[position])
+            with pytest.raises(ValueError, match="expected"):
+                row.fn(*args[:position], longer, *args[position + 1 :])
+
+
+@named("raises")
+def test_another_number_of_points_in_one_argument_raises(row):
+    args = row.make(2, 9, torch.float32)
+    for position in row.points if len(row.points) > 1 else ():
+        fewer = tensor_map(lambda v: v[:, :8] if v.shape[1:2] == (9,) else v, args[position])
+        with pytest.raises(ValueError, match="expected"):
+            row.fn(*args[:position], fewer, *args[position + 1 :])
+
+
 # ---------------------------------------------------------------------------------------------------- completeness
 
 

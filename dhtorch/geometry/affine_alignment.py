@@ -157,6 +157,7 @@ def register_affine(
     B, N = (
         check("register_affine", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN"
     )
+    _check_pyramids("register_affine", source, target, uv_0)
     with torch.no_grad():
         xy_0, xy_1, batch, usable = _flatten_points(source, target, uv_0, uv_1)
         if wanted is not None:
@@ -202,6 +203,7 @@ def registration_step(
         check("registration_step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k]
         for k in "BN"
     )
+    _check_pyramids("registration_step", source, target, uv_0)
     xy_0, xy_1, batch, usable = _flatten_points(source, target, uv_0, uv_1)
     q = round_half_up(xy_0)
     point = _window_coordinates(xy_0 - q, window)
@@ -215,6 +217,11 @@ def registration_step(
     warp = _compose(warp, _warp_change(solution[..., 0]), window)
     xy = torch.where(usable & solved, (warp * point[:, None]).sum(0), xy_1)
     return xy.T.reshape(B, N, 2).to(uv_0.dtype)
+
+
+def _check_pyramids(where: str, source: Pyramid, target: Pyramid, uv_0: Tensor) -> None:
+    """Raise a ValueError unless both pyramids have as many images as there are pairs of points (B, N, 2)."""
+    check(where, uv_0=(uv_0, "B N 2"), source=(source.levels[0], "B C H W"), target=(target.levels[0], "B c H_1 W_1"))
 
 
 def _flatten_points(

@@ -281,6 +281,8 @@ def depth_pixels(
     With ``depth_camera`` the pixel follows from the viewing ray; without one the map covers the same field as the image
     of size ``hw`` and the exact scaling rule of :func:`resize` applies.
     """
+    depth_f = None if depth_camera is None else depth_camera.f
+    check("camera.depth_pixels", f=(camera.f, "B 2"), depth_f=(depth_f, "B 2"), uv=(uv, "B N 2"))
     if depth_camera is not None:
         return _to_pixels(depth_camera, _normalised(camera, undistort(camera, uv)))
     if depth_hw == hw:

@@ -68,7 +68,7 @@ def triangulate(
     (``tests/geometry/test_epipolar.py``).
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
-    check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
+    _check_two_views("triangulate", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     return _triangulate(uv_0, uv_1, camera_0.f, camera_0.c, camera_1.f, camera_1.c, T_1_from_0.R, T_1_from_0.t)
 
 
@@ -111,9 +111,7 @@ def triangulate_depth(
 
     Gradient: as :func:`triangulate`.
     """
-    check(
-        "triangulate_depth", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2")
-    )
+    _check_two_views("triangulate_depth", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     step = max(chunk_size(MAX_CHUNK_TRIANGULATED, uv_0) // max(uv_0.shape[0], 1), 1)
     chunks = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
@@ -157,12 +155,21 @@ def describe_triangulation(
     T_1_from_0: Pose,
 ) -> TwoView:
     """:class:`TwoView` of points from another triangulation; the residual is the larger of the two views."""
-    check("describe_triangulation", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
+    check("describe_triangulation", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"))
+    _check_two_views("describe_triangulation", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     z = xyz_0[..., 2]
     x = xyz_0 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)[..., None]
     geometry = _two_view(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
     residual_0 = _length(uv_0 - cam.project(cam.ideal(camera_0), xyz_0))
     return geometry._replace(residual_px=torch.maximum(geometry.residual_px, residual_0))
+
+
+def _check_two_views(
+    where: str, uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose
+) -> None:
+    """Raise a ValueError unless pixels (B, N, 2) of both views, cameras and pose have the same B and N."""
+    check(where, uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
+    check(where, uv_0=(uv_0, "B N 2"), R=(T_1_from_0.R, "B 3 3"), t=(T_1_from_0.t, "B 3"))
 
 
 def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:

@@ -409,7 +409,7 @@ def aggregate_costs(
     Memory: two bytes per pixel and plane. Gradient: none.
     Source: H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", 2008, of four paths.
     """
-    check("aggregate_costs", C=(C, "B h w D"))
+    check("aggregate_costs", C=(C, "B h w D"), views=(views if isinstance(views, Tensor) else None, "B"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):

@@ -178,6 +178,7 @@ def adjoint(T: Pose) -> Tensor:
 
 def retract(T: Pose, xi: Tensor) -> Pose:
     """Retraction ``exp(xi) · T`` for tangents (B, 6)."""
+    check("se3.retract", R=(T.R, "B 3 3"), t=(T.t, "B 3"), xi=(xi, "B 6"))
     return compose(exp(xi), T)
 
 

@@ -366,6 +366,16 @@ def test_fewer_poses_than_images_are_matched_by_number(tmp_path: Path) -> None:
         data.open(tmp_path)
 
 
+def test_of_two_trajectories_the_one_of_more_frames_is_read(tmp_path: Path) -> None:
+    frames = walk(4)
+    writers.write_open3d(tmp_path, frames, trajectory="odometry.log")
+    writers.write_open3d(tmp_path, frames)
+    lines = (tmp_path / "trajectory.log").read_text().splitlines()
+    (tmp_path / "trajectory.log").write_text("\n".join(lines[:5]))
+    recording = data.open(tmp_path)
+    assert len(recording) == 4 and "poses are those of odometry.log; trajectory.log" in recording.report[0]
+
+
 def test_intrinsics_by_rows_are_noticed(tmp_path: Path) -> None:
     writers.write_open3d(tmp_path, walk(1))
     file = tmp_path / "camera_intrinsic.json"

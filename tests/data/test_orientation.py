@@ -214,6 +214,13 @@ def test_option_depth_turn_undoes_a_turn(tmp_path: Path, room: SyntheticRoom, tu
     same(data.open(tmp_path, depth_turn=turn), room, 0)
 
 
+def test_an_option_turns_the_depth_of_a_recording_whose_sizes_are_not_stated(room: SyntheticRoom) -> None:
+    turned = [f.replace(depth=orientation.apply_symmetry(f.depth, 1), depth_camera=None) for f in room]
+    recording = data.Recording("turned", "none", turned.__getitem__, torch.arange(5))
+    assert recording.stored is None
+    same(orientation.orient_recording(recording, 3), room, 0)
+
+
 def test_a_frame_of_mixed_orientation_is_refused_by_every_recording(room: SyntheticRoom) -> None:
     frame = room[0].replace(depth=torch.ones(1, 128, 96), depth_camera=None)
     recording = data.Recording("mixed", "none", lambda _: frame, torch.arange(1))

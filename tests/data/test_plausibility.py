@@ -77,6 +77,17 @@ def test_millimetres_as_metres_are_doubted_and_metres_of_a_street_are_not(codes)
     assert not plausibility_findings(street, None) and not plausibility_findings(street, MM, sparse=True)
 
 
+def test_every_row_of_a_small_map_counts_and_evenly_spaced_ones_of_a_large_one():
+    street = torch.zeros(2, 600)
+    street[1] = 3000.0
+    assert plausibility_findings([street], None, False)
+    large = torch.zeros(8, 6000)  # 48,000 values: every fourth row
+    large[1:4], large[5:] = 3000.0, 3000.0
+    assert not plausibility_findings([large], None, False)
+    large[4] = 3000.0
+    assert plausibility_findings([large], None, False)
+
+
 def test_swapped_bytes_are_found(codes):
     ((code, text, remedy),) = found([swap_bytes(c) for c in codes], MM)
     assert code == "byte_order" and "other byte order" in text and "swap" in remedy

@@ -310,6 +310,9 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         (root / "metadata.json").write_text(json.dumps({"calib": value}))
         with pytest.raises(FormatError, match=r"metadata.json: calib"):
             data.open(root)
+    (root / "metadata.json").write_text("{}")
+    with pytest.raises(FormatError, match=r"metadata.json: calib: found -1, expected .*-1 = none"):
+        data.open(root)
 
 
 def test_calibrations_elsewhere(tmp_path: Path) -> None:

@@ -167,6 +167,22 @@ def test_sigma_and_refusals_of_drawn_local_scales():
     np.testing.assert_allclose(estimate_scale(synthetic(noise=0.02), 24)[3], 0.02 / 12**0.5)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_one_wild_ratio_or_depth_counts_up_to_a_limit(side):
+    """The log ratio of one local scale within 1 of the median, its depth within 0.7 of the middle of the range."""
+    names, local = [str(k) for k in range(24)], synthetic()
+
+    def changes(log=0.0, along=0.0):
+        low, high = np.log(np.quantile(depth := local.depth.copy(), (0.05, 0.95)))
+        logs, last = local.log.copy(), int(np.argmax(side * depth))
+        logs[7] += side * log
+        depth[last] = np.exp((low + high) / 2 + side * along * (high - low)) if along else depth[last]
+        return [f.change for f in find_faults(local._replace(log=logs, depth=depth), names)[1]]
+
+    assert changes(log=1.2) == changes(log=3.0) != changes(log=0.9)
+    assert changes(along=0.75) == changes(along=3.0) != changes(along=0.65)
+
+
 def test_faults_are_ordered_by_their_excess():
     faults, _ = find_faults(synthetic(0.1), [str(k) for k in range(24)])
     of = ScaleTolerance()

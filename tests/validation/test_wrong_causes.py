@@ -208,6 +208,16 @@ def test_the_cause_follows_from_where_a_pixel_lies_and_what_refutes_it():
     assert name_causes(depth, state, misfit, points, flying)[0, 9, 12] == WrongCause.GHOST, "one surface of the map"
 
 
+@pytest.mark.parametrize("size", [0.5, 5.0])
+def test_evidence_of_any_size_points_to_one_side(size):
+    depth, none = two_sides(near=1.5, far=4.0), torch.full((1, 12, 16), NAN)
+    state, flying = torch.full((1, 12, 16), State.WRONG), torch.zeros(1, 12, 16, dtype=torch.bool)
+    state[0, :5], state[0, 6:] = State.CONSISTENT, State.CONSISTENT
+    for sign, bled in ((1.0, 8), (-1.0, 7)):
+        cause = name_causes(depth, state, torch.full_like(depth, sign * size), none, flying)[0, 5]
+        assert (cause[bled] == WrongCause.EDGE_BLEED) and (cause[15 - bled] == WrongCause.OTHER)
+
+
 def test_a_wide_wrong_region_does_not_bleed():
     depth = torch.full((1, 40, 40), 1.0)
     depth[..., 20:] = 2
