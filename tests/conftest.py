@@ -25,6 +25,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(20_000, 20, 20)  # reading thousands of tests, and parsing files, makes many objects that stay
 computed_once.parse_settings_once()
 computed_once.render_once()
+computed_once.check_captures_once()
+computed_once.list_modules_once()
 
 
 #: Without a GPU torch.manual_seed notes a call stack for the GPUs that may come, 1.4 ms of each test's time.

@@ -399,7 +399,7 @@ def planes_last(C: Tensor) -> Tensor:
 
 def aggregate_costs(
     C: Tensor,  # (B, h, w, D) integers
-    views: Tensor | int = 1,  # (B,) number of views whose costs C sums
+    views: Tensor | int = 1,  # (B,), or one for all: number of views whose costs C sums
     *,
     step: int = STEP_COST,
     jump: int = JUMP_COST,
@@ -409,8 +409,9 @@ def aggregate_costs(
     Memory: two bytes per pixel and plane. Gradient: none.
     Source: H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", 2008, of four paths.
     """
-    check("aggregate_costs", C=(C, "B h w D"), views=(views if isinstance(views, Tensor) else None, "B"))
-    price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
+    price = torch.as_tensor(views, dtype=torch.int16, device=C.device)
+    check("aggregate_costs", C=(C, "B h w D"), views=(price if price.dim() else None, "B"))
+    price = price.reshape(-1, 1, 1)
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
         _add_paths(C, S, dim, price * step, price * jump)

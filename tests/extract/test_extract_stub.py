@@ -67,6 +67,16 @@ def test_what_a_killed_run_left_is_gone(made, tmp_path):
     assert made().code == 0 and not left.exists()
 
 
+def test_a_file_at_a_shards_place_that_dhtorch_did_not_write_is_refused_before_any_row(made, tmp_path):
+    foreign = tmp_path / "out" / "shard-00001.parquet"
+    foreign.parent.mkdir()
+    foreign.write_bytes(b"foreign")
+    loaded = []
+    with pytest.raises(FileExistsError, match=r"shard-00001\.parquet.*dhtorch did not write"):
+        made(recording(9, load=loaded.append, gap=1))
+    assert foreign.read_bytes() == b"foreign" and not loaded
+
+
 def test_one_recording_need_not_be_a_list(made):
     done = made(recording(3), options={"gap": 0})
     assert done.said.startswith(f"{done.folder}: 1 shard, 3 rows") and "3 no second view" in done.said

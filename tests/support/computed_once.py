@@ -1,14 +1,22 @@
-"""Parsed settings and rendered pictures are computed once in a process, however many tests ask for the same ones.
+"""Parsed settings, rendered pictures, checks of captures and lists of modules are computed once in a process, however
+many tests ask for the same ones.
 
-Both are functions of their arguments alone: the second call has a copy of what the first returned.
+All are functions of their arguments alone: the second call has a copy of what the first returned.
 """
 
 import copy
+import hashlib
 from collections import OrderedDict
+from dataclasses import replace
 
+import torch
 import yaml
+from torch.utils import _pytree
 
+from dhtorch.cli import capture_checks
+from dhtorch.runtime import code_dependencies
 from dhtorch.synthetic import recording
+from dhtorch.validation import capture_check
 
 #: Rooms that are kept, of 90 MB each.
 MAX_ROOMS = 4
@@ -78,3 +86,41 @@ def render_anew(monkeypatch):
     """For one test, the renderer itself."""
     monkeypatch.setattr(recording, "furnished_room", _ONCE.furnish)
     monkeypatch.setattr(recording, "_photograph", _ONCE.photograph)
+
+
+def check_captures_once():
+    """Replace the check before every command by one that examines the same frames, poses and unit once."""
+    examine, checks = capture_checks.check_capture, {}
+
+    def check_once(capture):
+        window = capture_check._read_window(capture, {})
+        parts = (window, capture.poses, capture.number, capture.times, capture.depth_unit, capture.sparse, len(capture))
+        total = hashlib.sha256()
+        for x in _pytree.tree_leaves(parts):
+            numbers = isinstance(x, torch.Tensor)
+            total.update(
+                repr((x.shape, x.dtype) if numbers else x).encode() + (x.numpy().tobytes() if numbers else b"")
+            )
+        key = total.digest()
+        if key not in checks:
+            checks[key] = examine(capture)
+        found = checks[key]
+        usable = replace(capture, poses=None) if found.poses_refuted else capture
+        return replace(found, recording=usable)
+
+    capture_checks.check_capture = check_once
+
+
+def list_modules_once():
+    """Replace the search for the modules that an installed one imports by one that reads their files once."""
+    find, found = code_dependencies.find_reachable_modules, {}
+
+    def find_once(names, folder=None):
+        key = tuple(names)
+        if folder is not None:
+            return find(key, folder)
+        if key not in found:
+            found[key] = find(key)
+        return dict(found[key])
+
+    code_dependencies.find_reachable_modules = find_once
