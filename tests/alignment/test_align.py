@@ -39,7 +39,15 @@ def error(found, truth):
     return float(((found.depth - truth).abs() / truth)[found.keep].median())
 
 
-@pytest.mark.parametrize("name", ["scale_short", "shift", "tilt", "simulated"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "scale_short",
+        pytest.param("shift", marks=pytest.mark.slow),
+        "tilt",
+        pytest.param("simulated", marks=pytest.mark.slow),
+    ],
+)
 def test_faults_are_taken_out(name):
     truth, near, far = world()
     x, _ = depth_faults.apply_fault(name, truth)
@@ -87,7 +95,8 @@ def test_a_map_that_is_right_is_left_alone():
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize(
-    ("expected", "scale", "shift"), [("scale", 0.8, 0.0), ("shift", 1.0, -0.15), ("shift", 1.0, 0.4)]
+    ("expected", "scale", "shift"),
+    [("scale", 0.8, 0.0), pytest.param("shift", 1.0, -0.15, marks=pytest.mark.slow), ("shift", 1.0, 0.4)],
 )
 def test_one_number_that_is_missing_is_told_from_two(expected, scale, shift, seed):
     """A shift is one number, and returns of some noise tell it as well as a scale: to the noise over the root of their

@@ -406,7 +406,7 @@ def test_a_recalibrated_score_is_the_tables_probability():
     assert torch.equal(kept, raw >= fitted().thresholds[10]) and 0 < kept.sum() < 40
 
 
-@pytest.mark.parametrize("kind", ["table", "sigmoid"])
+@pytest.mark.parametrize("kind", ["table", pytest.param("sigmoid", marks=pytest.mark.slow)])
 def test_a_recalibrated_stage_captures_maps_differentiates_and_keeps_to_itself(kind):
     learnt = fitted()
     stage = functools.partial(

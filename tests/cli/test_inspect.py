@@ -121,6 +121,7 @@ BELOW = {n: ("", "one", "one/two")[k % 3] for k, n in enumerate(WRITTEN)} | {"ca
 
 #: Further layouts of formats of which one is among the others, and formats whose reader has tests of the same capture.
 SLOW = (
+    "named",
     "driving",
     "stray",
     "stray_depth_only",

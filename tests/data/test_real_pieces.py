@@ -24,9 +24,9 @@ real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 WORLD = [
     ("holo_a", 3, 0.004),
     ("7s_redkitchen_000", 20, 0.006),
-    ("7s_redkitchen_200", 20, 0.010),
+    pytest.param("7s_redkitchen_200", 20, 0.010, marks=pytest.mark.slow),
     ("7s_redkitchen_400", 20, 0.008),
-    ("7s_redkitchen_600", 20, 0.008),
+    pytest.param("7s_redkitchen_600", 20, 0.008, marks=pytest.mark.slow),
     ("tum_fr1_desk9", 4, 0.007),
     ("tum_fr1_rpy_a", 4, 0.013),
 ]

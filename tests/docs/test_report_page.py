@@ -45,6 +45,12 @@ def result(request):
     return results()[NAMES.index(request.param)]
 
 
+@functools.cache
+def page_of(name):
+    """The page of one result."""
+    return page.render_report([results()[NAMES.index(name)]])
+
+
 def parse(markup):
     assert markup.startswith("<!doctype html>\n")
     return ET.fromstring(markup.removeprefix("<!doctype html>"))
@@ -58,9 +64,9 @@ def words(tree):
 # ---------------------------------------------------------------------------------------------------- the page
 
 
-@every
-def test_the_page_is_whole_and_needs_nothing_else(result):
-    made = page.render_report([result])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_is_whole_and_needs_nothing_else(name):
+    made = page_of(name)
     tree = parse(made)
     assert tree.get("lang") == "en" and tree.find("head/title").text
     for word in ("http", "//", "@import", "url(", "<script", "<link", "<img"):
@@ -81,9 +87,9 @@ def test_the_page_is_whole_and_needs_nothing_else(result):
     assert used and not [c for c in used if f".{c}" not in style and f'[class^="{c[:4]}"]' not in style]
 
 
-@every
-def test_the_page_holds_every_scene_and_every_number(result):
-    tree = parse(page.render_report([result]))
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_holds_every_scene_and_every_number(name):
+    result, tree = results()[NAMES.index(name)], parse(page_of(name))
     said = words(tree)
     for row in scene_rows(result):
         assert row["scene"] in said and row["method"] in said

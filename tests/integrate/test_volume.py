@@ -71,7 +71,10 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
     return distance, weight, swept, coloured, colour, sure
 
 
-@pytest.mark.parametrize(("carve", "max_reach", "sigma"), [(True, 3.0, 0.02), (False, 3.0, 0.15), (True, 1.2, 0.15)])
+@pytest.mark.parametrize(
+    ("carve", "max_reach", "sigma"),
+    [pytest.param(True, 3.0, 0.02, marks=pytest.mark.slow), (False, 3.0, 0.15), (True, 1.2, 0.15)],
+)
 def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
     volume = make_volume(0.1, truncation=0.25, channels=2)
     looks = [(looked(0), 0), (looked(1, sigma, far=1.7), 1), (looked(2, sigma), 2), (looked(3), 2)]

@@ -91,7 +91,7 @@ def test_a_plain_function_in_every_stage_answers_as_the_stage_itself(room):
     assert alike(PLAIN(room[0], [room[k] for k in (1, 2, 3)], views=2), USUAL(room[0], others, views=2))
 
 
-@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("views", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
     scene = Scene(room, near=2.0, levels=2)
     # A score of one's own may be made of sigma, so that sigma is evaluated: not so with the paper's function itself.

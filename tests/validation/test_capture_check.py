@@ -76,9 +76,11 @@ def test_a_stated_unit_is_not_announced(frames):
 @pytest.mark.parametrize(
     "convention",
     [
-        "wxyz",
         "mm",
-        *(pytest.param(c, marks=pytest.mark.slow) for c in ("world_to_camera", "opengl", "world_to_camera+opengl")),
+        *(
+            pytest.param(c, marks=pytest.mark.slow)
+            for c in ("wxyz", "world_to_camera", "opengl", "world_to_camera+opengl")
+        ),
     ],
 )
 def test_refuted_poses_are_named_and_removed(convention, frames, true):

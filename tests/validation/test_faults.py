@@ -157,7 +157,15 @@ def test_a_fault_that_is_no_known_one_is_not_named_after_the_nearest(frames, wat
         assert diagnose(shown, [f.depth**power for f in frames], method=METHOD, watched=watched).cause is None
 
 
-@pytest.mark.parametrize(("field", "bound"), [(1.6, ""), (0.65, ""), (1.95, "at least "), (0.5, "at most ")])
+@pytest.mark.parametrize(
+    ("field", "bound"),
+    [
+        (1.6, ""),
+        pytest.param(0.65, "", marks=pytest.mark.slow),
+        (1.95, "at least "),
+        pytest.param(0.5, "at most ", marks=pytest.mark.slow),
+    ],
+)
 def test_a_field_is_told_within_a_step_and_beyond_them_as_a_bound(field, bound, frames, watched):
     shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
     found = diagnose(shown, [rescale_field_of_view(f.depth, 1 / field) for f in frames], method=METHOD, watched=watched)

@@ -112,7 +112,7 @@ def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, til
     assert 0 < low < tilt < high
 
 
-@pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
+@pytest.mark.parametrize("factor", [1.1, pytest.param(1 / 1.1, marks=pytest.mark.slow)])
 def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, reference, others, sound):
     found = validate_depth(factor * true, reference, others, **SMALL, views=False)
     for name in ("scale", "scale_near", "scale_far"):
@@ -221,14 +221,16 @@ def test_maps_of_other_views_see_through_what_stands_too_near(room, true, refere
     assert (found.consistency_evidence[told & ~inside] < -3).float().mean() < 0.1
 
 
-@pytest.mark.parametrize("fewer", [4, 8])
+@pytest.mark.parametrize("fewer", [pytest.param(4, marks=pytest.mark.slow), 8])
 def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, reference, asked):
     """An outline lies anywhere between two of their pixels, and what is before it may be either's."""
     maps = torch.stack([room.truth(k)["depth"][:, fewer // 2 :: fewer, fewer // 2 :: fewer] for k in OTHERS])
     assert not (validate_against(true, reference, asked, other_maps=maps, **SMALL).consistency_evidence < -3).any()
 
 
-@pytest.mark.parametrize(("n", "good"), [(2, (1,)), (7, (3, 6))])  # more than are looked at, too
+@pytest.mark.parametrize(
+    ("n", "good"), [pytest.param(2, (1,), marks=pytest.mark.slow), (7, (3, 6))]
+)  # more than are looked at, too
 def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, true, reference, others):
     blank = torch.full_like(others.image[0], 128)
     offered = [others[k % len(OTHERS)] for k in range(n)]
@@ -276,7 +278,7 @@ def test_what_is_no_map_is_refused(bad, said, true, reference):
         validate_depth(true, reference, other_maps=bad(true)[None])
 
 
-@pytest.mark.parametrize("fewer", [4, 8])
+@pytest.mark.parametrize("fewer", [pytest.param(4, marks=pytest.mark.slow), 8])
 def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, true, reference, others, sound):
     """A value of a coarse map stands for many pixels of the grid: beside an outline either surface may be theirs."""
 
