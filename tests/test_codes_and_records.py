@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from dhtorch import codes, pytree
-from dhtorch.codes import Flag, Gate, Hole, Source
-from dhtorch.records import Camera, Pose, Samples, SigmaBudget, depth_interval
+from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source
+from dhtorch.records import Camera, Pose, PoseFit, Samples, SigmaBudget, depth_interval
 
 
 def test_codes_are_named_by_column_alone_and_in_lists():
@@ -34,6 +34,12 @@ def test_the_first_reason_counts():
     assert codes.first_reason((one, 5), (two, 7), otherwise=3).tolist() == [5, 5, 7, 3]
     assert codes.describe(Gate, "parallax") == codes.describe(Gate, "PARALLAX") is not None
     assert codes.describe(Gate, "nothing") is None
+
+
+def test_a_pose_is_one_by_its_code_alone():
+    values = list(codes.names(PoseCode))
+    fit = PoseFit(*7 * [None], code=torch.tensor(values, dtype=torch.int32))
+    assert len(values) > 4 and fit.ok.tolist() == [value in (PoseCode.OK, PoseCode.KEPT_PNP) for value in values]
 
 
 def camera(k, n=2):

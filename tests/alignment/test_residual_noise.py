@@ -1,5 +1,7 @@
 """How far an aligned map is off from pixel to pixel: only as far as near returns show it, and where they do."""
 
+import math
+
 import pytest
 import torch
 
@@ -201,3 +203,41 @@ def test_what_is_off_in_one_place_is_no_doubt_in_another():
     one = torch.ones(1, 50, dtype=torch.float64)
     found = _local_variance(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool), OPTIONS)[0]
     assert found[2, 3] > 0.9 and found[:3, 22:].max() < 0.01 and found[-10:].max() < 0.01
+
+
+def test_local_variance_is_that_of_kernels_at_nodes_between_which_a_pixel_is_interpolated():
+    """By plain loops, for some pixels: nodes from border to border and from the least depth to the largest."""
+    g = torch.Generator().manual_seed(0)
+    h, w, n = 24, 40, 200
+    log = torch.rand(1, h, w, generator=g, dtype=torch.float64)
+    share, log_at, excess = (torch.rand(1, n, *k, generator=g, dtype=torch.float64) for k in ((2,), (), ()))
+    used = torch.rand(1, n, generator=g) < 0.7
+    found = _local_variance(share, log_at, (excess, used), log, torch.ones_like(log, dtype=torch.bool), OPTIONS)[0]
+    low, high = float(log.min()), float(log.max())
+    width, height = w / max(h, w), h / max(h, w)
+    depth_step = max((high - low) / (OPTIONS.n_depth_bins - 1), OPTIONS.depth_kernel_width)
+
+    def nodes(side):
+        count = max(3, round(2 * side / OPTIONS.place_kernel_width))
+        return [side * k / (count - 1) for k in range(count)]
+
+    def between(at, places):
+        k = min(max(sum(p <= at for p in places) - 1, 0), len(places) - 2)
+        part = (at - places[k]) / (places[k + 1] - places[k])
+        return [(places[k], 1 - part), (places[k + 1], part)]
+
+    def bell(distance, length):
+        return math.exp(-0.5 * (distance / length) ** 2)
+
+    depths = [low + (high - low) * k / (OPTIONS.n_depth_bins - 1) for k in range(OPTIONS.n_depth_bins)]
+    for row, column in ((3, 5), (12, 30), (20, 11)):
+        mass = total = 0.0
+        for x, of_x in between((column + 0.5) / w * width, nodes(width)):
+            for y, of_y in between((row + 0.5) / h * height, nodes(height)):
+                for z, of_z in between(float(log[0, row, column]), depths):
+                    for i in range(n):
+                        kernel = of_x * of_y * of_z * bell(float(log_at[0, i]) - z, depth_step) * bool(used[0, i])
+                        kernel *= bell(float(share[0, i, 0]) * width - x, OPTIONS.place_kernel_width)
+                        kernel *= bell(float(share[0, i, 1]) * height - y, OPTIONS.place_kernel_width)
+                        mass, total = mass + kernel, total + kernel * float(excess[0, i])
+        assert float(found[row, column]) == pytest.approx(total / (mass + OPTIONS.empty_kernel_weight), rel=1e-4)
