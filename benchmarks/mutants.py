@@ -487,6 +487,10 @@ class Record:
         self.times.write_text(json.dumps(self.seconds))
 
 
+#: Words of pytest where the package, which all tests load, cannot be imported with the fault.
+UNLOADED = "ImportError while loading conftest"
+
+
 class Tried(NamedTuple):
     """What became of some tests."""
 
@@ -518,9 +522,10 @@ def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: 
     if code < 0 and not failure.exists():
         return Tried(True, f"ended by {signal.Signals(-code).name}")
     if code not in (0, 1, NONE) and not failure.exists():
-        raise RuntimeError(
-            f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
-        )
+        log = (tree / "log").read_text()
+        if UNLOADED not in log:
+            raise RuntimeError(f"mutants: the tests of {module} could not be run (exit code {code}): {log[-2000:]}")
+        return Tried(True, f"{UNLOADED}: {log.strip().splitlines()[-1]}")
     why, seconds = (
         failure.read_text() if failure.exists() else "",
         json.loads(times.read_text()) if times.exists() else {},
