@@ -107,6 +107,12 @@ def test_depth_of_8_bits_is_found(codes, step):
     assert code == "8_bit" and "equal steps" in text and "16 bits" in remedy
 
 
+@pytest.mark.parametrize(("n", "doubted"), [(2, False), (3, True), (256, True), (257, False)])
+def test_8_bit_depth_has_three_to_256_different_values(n, doubted):
+    floats = (1.0 + 0.02 * (torch.arange(1200.0) % n)).reshape(30, 40)
+    assert [f.code for f in plausibility_findings([floats], MM, False)] == ["8_bit"] * doubted
+
+
 def test_disparities_in_few_steps_are_not_8_bit_depth(codes):
     stereo = [(285_000 / (285_000 / c).round()).round().long() for c in codes]
     assert len(torch.cat(stereo).unique()) <= 256 and not found(stereo, MM)

@@ -9,7 +9,7 @@ import torch
 
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.integrate import DepthView, extract_points, fuse_views, make_volume, recording, splat_points
-from dhtorch.integrate.volume import VOLUME_SOURCES, Volume
+from dhtorch.integrate.volume import VOLUME_SOURCES, Volume, reserve_blocks
 from dhtorch.records import Camera, Frame
 
 CAMERA = Camera(torch.tensor([[22.0, 18.0]]), torch.tensor([[10.5, 6.25]]))
@@ -96,6 +96,39 @@ def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
     np.testing.assert_allclose(blank.distance.flatten().numpy()[sure], distance[sure], atol=1e-4)
     np.testing.assert_allclose(features[:, 0], coloured[sure], atol=4e-3)
     np.testing.assert_allclose(features[:, 1:], colour[sure], atol=4e-3)
+
+
+def test_a_volume_changes_only_where_that_is_wanted():
+    view = looked(0)
+    once = fuse_views(make_volume(0.1, truncation=0.25, channels=2), view)
+    before = once.replace(**{name: getattr(once, name).clone() for name in ("distance", "weight", "features")})
+    twice = fuse_views(once, view)
+    assert torch.equal(once.weight, before.weight) and torch.equal(once.features, before.features)
+    torch.testing.assert_close(twice.weight, 2 * once.weight)
+    same = fuse_views(once, view, in_place=True)
+    assert same is once and torch.equal(once.weight, twice.weight) and torch.equal(once.distance, twice.distance)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda v: v.replace(depth=v.depth[0]),
+        lambda v: v.replace(sigma=v.sigma[:, 1:]),
+        lambda v: v.replace(features=v.features[..., :1]),
+        lambda v: v.replace(features=v.features[:, 1:]),
+        lambda v: v.replace(camera=v.camera.replace(f=v.camera.f[0])),
+        lambda v: v.replace(camera=v.camera.map(lambda x: torch.cat((x, x)))),
+        lambda v: v.replace(T_world_from_cam=v.T_world_from_cam.replace(R=v.T_world_from_cam.R[:, :2])),
+        lambda v: v.replace(T_world_from_cam=v.T_world_from_cam.replace(t=v.T_world_from_cam.t[:, :2])),
+        lambda v: v.replace(T_world_from_cam=v.T_world_from_cam.map(lambda x: torch.cat((x, x)))),
+    ],
+)
+def test_views_of_other_shapes_are_refused(wrong):
+    volume = make_volume(0.1, channels=2)
+    for call in (fuse_views, reserve_blocks):
+        call(volume, looked(0))
+        with pytest.raises(ValueError, match=r"fuse_views: .* expected"):
+            call(volume, wrong(looked(0)))
 
 
 def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
