@@ -1,15 +1,14 @@
 """The public surface: what users may rely on, held with signatures in ``api_surface.json``.
-
-python tests/test_api_surface.py      write the file anew, after a change that is meant
+``DHTORCH_STORE=1 pytest tests/test_api_surface.py`` stores it anew, after a change that is meant.
 """
 
 import dataclasses
 import importlib
 import inspect
-import json
 from pathlib import Path
 
 import pytest
+from support.stored_values import stored_values
 
 FILE = Path(__file__).with_name("api_surface.json")
 
@@ -77,7 +76,8 @@ def surface():
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_public_surface_is_the_one_that_is_written_down(package):
-    wanted, found = json.loads(FILE.read_text(encoding="utf-8"))[package], surface()[package]
+    found = surface()[package]
+    wanted = stored_values(FILE, {package: found}, PACKAGES)[package]
     changes = [f"{name} is gone" for name in wanted.keys() - found.keys()]
     changes += [f"{name} is new" for name in found.keys() - wanted.keys()]
     changes += [
@@ -85,9 +85,8 @@ def test_the_public_surface_is_the_one_that_is_written_down(package):
         for name in wanted.keys() & found.keys()
         if wanted[name] != found[name]
     ]
-    assert not changes, (
-        f"{package}: {sorted(changes)}; meant? python tests/test_api_surface.py, and say so in CHANGELOG.md"
-    )
+    command = "DHTORCH_STORE=1 pytest tests/test_api_surface.py"
+    assert not changes, f"{package}: {sorted(changes)}; meant? {command}, and say so in CHANGELOG.md"
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -98,8 +97,3 @@ def test_every_package_states_its_public_names(package):
     for name in names:
         value = getattr(module, name)
         assert inspect.ismodule(value) or value.__doc__ or not callable(value), f"{package}.{name} has no docstring"
-
-
-if __name__ == "__main__":
-    FILE.write_text(json.dumps(surface(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    print(f"wrote {FILE}")

@@ -2,24 +2,19 @@
 
 Whatever changes a number of the method changes one here, however small. Other tests say whether an answer is right.
 Parts that compute in single precision (windows, cost volumes) depend on the processor's vectors: to a hundredth.
-
-python tests/test_stored_answers.py      write the file anew, after a change of answers that is meant
+``DHTORCH_STORE=1 pytest tests/test_stored_answers.py`` stores them anew, after a change that is meant.
 """
 
-import json
-import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
-import torch
-
-sys.path.insert(0, str(Path(__file__).parent))  # as a command
-
 import test_contract
+import torch
 from support import digests
 from support.random_answers import random_points
 from support.room_models import room_model, room_scene
+from support.stored_values import stored_values
 
 from dhtorch import CameraPin, align_depth, complete_depth, validate_depth
 from dhtorch.alignment.references import collect_references
@@ -202,18 +197,16 @@ def found(name):
         return digests.digest(PROBLEMS[name]())
 
 
-STORED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
-
-
-def test_every_problem_is_stored():
-    assert list(STORED) == list(PROBLEMS)
-
-
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_an_answer_is_the_one_that_is_stored(name):
     tolerance = next((limit for start, limit in TOLERANCES.items() if name.startswith(start)), digests.TOLERANCE)
-    wrong = digests.differences(found(name), STORED[name], tolerance)
+    now = found(name)
+    wrong = digests.differences(now, stored_values(FILE, {name: now}, PROBLEMS)[name], tolerance)
     assert not wrong, "\n".join(wrong)
+
+
+def test_every_problem_is_stored():
+    assert list(stored_values(FILE)) == list(PROBLEMS)
 
 
 def test_a_changed_answer_is_noticed():
@@ -224,10 +217,3 @@ def test_a_changed_answer_is_noticed():
         assert len(digests.differences(digests.digest({"depth": other, "name": "a"}), one)) == 1
     assert len(digests.differences(digests.digest({"depth": x, "name": "b"}), one)) == 1
     assert len(digests.differences(digests.digest({"depth": x}), one)) == 1
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    names = [name for name in PROBLEMS if not sys.argv[1:] or name in sys.argv[1:]]
-    stored = STORED | {name: found(name) for name in names}
-    FILE.write_text(digests.dump({name: stored[name] for name in PROBLEMS}), encoding="utf-8")

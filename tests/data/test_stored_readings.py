@@ -1,22 +1,17 @@
 """What is read of a small capture of every format, and the errors of damaged ones, are stored in ``stored_readings.json``.
 
 Whatever changes a number, a note or an error of a reader changes a line here. Other tests say whether it is right.
-
-python tests/data/test_stored_readings.py      write the file anew, after a change that is meant
+``DHTORCH_STORE=1 pytest tests/data/test_stored_readings.py`` stores them anew, after a change that is meant.
 """
 
 import json
 import random
 import re
-import sys
-import tempfile
 import warnings
 from pathlib import Path
 from unittest import mock
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # as a command
 
 pytest.importorskip("av")
 pytest.importorskip("h5py")
@@ -27,6 +22,7 @@ pytest.importorskip("pyarrow")
 from support import byte_damage, digests
 from support import damage_harness as harness
 from support.captures_by_format import SAMPLES
+from support.stored_values import stored_values
 
 from dhtorch.cli import inspect
 from dhtorch.data import FormatError
@@ -100,16 +96,10 @@ def found(name, folder):
     return result | {"damaged": errors}
 
 
-STORED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
-
-
-def test_every_format_is_stored():
-    assert list(STORED) == list(SAMPLES)
-
-
 @pytest.mark.parametrize("name", SAMPLES)
 def test_a_format_reads_as_it_is_stored(name, tmp_path):
-    now, stored = found(name, tmp_path), STORED[name]
+    now = found(name, tmp_path)
+    stored = stored_values(FILE, {name: now}, SAMPLES)[name]
     assert now["damaged"] == stored["damaged"] and len(now["inspect"]) == len(stored["inspect"])
     for line, expected in zip(now["inspect"], stored["inspect"], strict=True):  # shares depend on the processor
         assert digests.alike(line, expected, 0.02, 0.02), f"found {line}, stored {expected}"
@@ -122,9 +112,5 @@ def test_a_format_reads_as_it_is_stored(name, tmp_path):
     assert not wrong, "\n".join(wrong)
 
 
-if __name__ == "__main__":
-    lines = {}
-    for name in SAMPLES:
-        with tempfile.TemporaryDirectory() as folder:
-            lines[name] = found(name, Path(folder))
-    FILE.write_text(digests.dump(lines), encoding="utf-8")
+def test_every_format_is_stored():
+    assert list(stored_values(FILE)) == list(SAMPLES)

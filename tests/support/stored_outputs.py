@@ -1,14 +1,14 @@
 """What a command prints and writes, against what is stored of it: texts to the letter, numbers to a tenth.
 
-``DHTORCH_STORE=1 pytest PATH`` stores anew what the tests of PATH print and write, after a change that is meant.
+``DHTORCH_STORE=1 pytest PATH`` stores anew what the commands of PATH print and write, after a change that is meant.
 """
 
 import json
-import os
 import re
 from pathlib import Path
 
 from support.digests import alike
+from support.stored_values import stored_values
 
 FOLDER = Path(__file__).parents[1] / "cli" / "stored_outputs"
 
@@ -57,10 +57,7 @@ def _plain(line):
 def check(name, root, *, printed="", folder=None):
     """Assert that a command printed and wrote what is stored under a name; paths below ``root`` are left out."""
     found, file = collected(printed, folder, root), FOLDER / f"{name}.json"
-    if os.environ.get("DHTORCH_STORE"):
-        FOLDER.mkdir(exist_ok=True)
-        file.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    stored = json.loads(file.read_text(encoding="utf-8"))
+    stored = stored_values(file, found, found)
     assert found.keys() == stored.keys()
     wrong = [
         f"{key}: {len(found[key])} lines, stored are {len(lines)}"

@@ -1,20 +1,15 @@
 """Figures draw what is stored in ``drawn_figures.json``: every artist with its place, colour, width and letters.
-
-python tests/viz/test_drawn_figures.py      write the file anew, after the pictures have been looked at
+``DHTORCH_STORE=1 pytest tests/viz/test_drawn_figures.py`` stores them anew, after the pictures have been looked at.
 """
 
 import io
-import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # as a command
-
 from support import drawn
+from support.stored_values import stored_values
 
 from dhtorch.cli import inspect as capture
 from dhtorch.codes import Gate, Hole, Source, State, names
@@ -180,19 +175,18 @@ def found_figures(monkeypatch, folder):
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        yield found_figures(patch, tmp_path_factory.mktemp("drawn"))
-
-
-STORED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+        figures = found_figures(patch, tmp_path_factory.mktemp("drawn"))
+    stored_values(FILE, figures, figures)
+    return figures
 
 
 def test_every_figure_is_stored(found):
-    assert list(found) == list(STORED)
+    assert list(found) == list(stored_values(FILE))
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", stored_values(FILE))
 def test_a_figure_shows_what_is_stored(found, name):
-    assert not drawn.differences(found[name], STORED[name])
+    assert not drawn.differences(found[name], stored_values(FILE)[name])
 
 
 def test_a_changed_figure_is_noticed():
@@ -204,11 +198,3 @@ def test_a_changed_figure_is_noticed():
     one, other = np.zeros((4, 5)), np.zeros((4, 5))
     other[2, 3] = 1
     assert drawn.summarise(one) != drawn.summarise(other) != drawn.summarise(other[::-1])
-
-
-if __name__ == "__main__":
-    import tempfile
-
-    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
-        lines = found_figures(patch, Path(sys.argv[1] if len(sys.argv) > 1 else folder))
-    FILE.write_text(json.dumps(lines, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
