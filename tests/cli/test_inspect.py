@@ -25,7 +25,7 @@ from dhtorch.cli import inspect as capture
 from dhtorch.cli import run
 from dhtorch.data import FormatError
 from dhtorch.data.recording import Recording
-from dhtorch.data.survey import Survey, survey_recording
+from dhtorch.data.survey import Survey, report_depths, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.survey import survey_stacks
@@ -262,6 +262,18 @@ def test_times_that_stand_or_gap() -> None:
     back = torch.tensor([0, 1, 1, 2, 3, 4], dtype=torch.float64) / 30
     assert "time stamps do not increase at 1 place" in warned(frames, times=back)
     assert "no time stamps" in warned(frames, times=None)
+
+
+@pytest.mark.parametrize(("spread", "is_flat"), [(0.0009, True), (0.0011, False)])
+@pytest.mark.parametrize("many_holes", [False, True])
+def test_limits_of_depth_maps(spread: float, is_flat: bool, many_holes: bool) -> None:
+    depth = 2 + spread * torch.linspace(0, 1, 100).reshape(10, 10)
+    depth.flatten()[1 : 52 if many_holes else 51] = 0
+    survey = Survey("depth", "none")
+    report_depths([depth], survey)
+    assert dict(survey.facts)["holes"] == ("51.0" if many_holes else "50.0") + " % of the depth map"
+    holes, flat = ["most of the depth map is holes (51 %)"], ["depth is the same everywhere"]
+    assert survey.warnings == holes * many_holes + flat * is_flat
 
 
 @pytest.mark.slow

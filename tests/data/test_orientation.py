@@ -16,7 +16,7 @@ from dhtorch import data
 from dhtorch.data import FormatError, convert, orientation
 from dhtorch.data.codecs import video
 from dhtorch.data.io import decode as files
-from dhtorch.data.stored_sizes import describe_mismatch
+from dhtorch.data.stored_sizes import StoredSizes, describe_mismatch
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing.mp4 import write_video
 
@@ -219,6 +219,23 @@ def test_an_option_turns_the_depth_of_a_recording_whose_sizes_are_not_stated(roo
     recording = data.Recording("turned", "none", turned.__getitem__, torch.arange(5))
     assert recording.stored is None
     same(orientation.orient_recording(recording, 3), room, 0)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("by_K", [True, False])
+def test_without_depth_over_the_picture_K_decides_whether_pictures_are_turned(
+    room: SyntheticRoom, k: int, by_K: bool
+) -> None:
+    camera = convert.rot90_camera(room[0].camera, HW, k) if by_K else room[0].camera
+    frames = [f.replace(camera=camera, depth_camera=f.camera) for f in room]
+    sizes = StoredSizes(HW, None, k, "EXIF orientation")
+    oriented = orientation.orient_recording(
+        data.Recording("own", "none", frames.__getitem__, torch.arange(5), stored=sizes)
+    )
+    picture = orientation.apply_symmetry(room[0].image[0], k) if by_K else room[0].image[0]
+    assert torch.equal(oriented.load(0).image[0], picture) and torch.equal(oriented.load(0).depth, room[0].depth)
+    done = f"pictures are {orientation.SYMMETRY_NAMES[k]}" if by_K else "pictures are read as stored"
+    assert oriented.report == (f"orientation: EXIF orientation: {done}, as K lies",)
 
 
 def test_a_frame_of_mixed_orientation_is_refused_by_every_recording(room: SyntheticRoom) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -295,3 +296,19 @@ def test_a_minute_of_robot() -> None:
     np.save(content, np.array(minute, dtype=object), allow_pickle=True)
     got = pickles.load_pickle(content.getvalue()[128:], FILE)
     assert same(got["9"][599], minute["9"][599])
+
+
+@pytest.mark.parametrize("inner", [11, 15, 22, 30, 37])
+def test_containers_that_share_parts_have_at_most_eight_values_per_instruction_and_64(inner: int) -> None:
+    """A list of numbers that stands in another one several times, at two bytes each time."""
+    accepted = set()
+    for times in range(1, 56):
+        content = b"\x80\x02](]q\x01(" + inner * b"K\x01" + b"e" + (times - 1) * b"h\x01" + b"e."
+        n_values, n_instructions = 1 + times * (inner + 1), len(list(pickletools.genops(content)))
+        accepted.add(within := n_values <= 8 * n_instructions + 64)
+        if within:
+            assert pickles.load_pickle(content, FILE) == times * [inner * [1]]
+        else:
+            with pytest.raises(FormatError, match="containers nested too deep"):
+                pickles.load_pickle(content, FILE)
+    assert len(accepted) == 2 or inner < 16

@@ -145,6 +145,9 @@ def test_driving_gives_back_the_scene(tmp_path: Path) -> None:
     torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=2e-6, rtol=0)
     check_same(recording, frames, 1e-5)
 
+    for n, rate in ((1, None), (2, pytest.approx(30, rel=1e-3))):
+        writers.write_driving(tmp_path / f"{n} frames", {"FRONT": frames[:n]}, lidar.map(lambda x, n=n: x[:n]))
+        assert data.open(tmp_path / f"{n} frames", hide_px=0).rate_hz == rate
     other = [render(CAMERA, pose(i + 7), HW, 100 + i / 30) for i in range(3)]
     writers.write_driving(tmp_path / "two", {"FRONT": frames, "LEFT": other}, lidar)
     with pytest.raises(FormatError, match=r"found 2 recordings: two/FRONT, two/LEFT, expected one"):

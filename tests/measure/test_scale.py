@@ -183,6 +183,15 @@ def test_one_wild_ratio_or_depth_counts_up_to_a_limit(side):
     assert changes(along=0.75) == changes(along=3.0) != changes(along=0.65)
 
 
+@pytest.mark.parametrize(("region", "row", "column"), [(0, 1, 1), (6, 2, 3), (11, 3, 4)])
+def test_a_region_of_the_picture_is_named_by_its_row_and_column(region, row, column):
+    local = synthetic(noise=0.004)
+    local = local._replace(log=local.log + 0.2 * (local.region == region))
+    first = find_faults(local, [str(k) for k in range(24)])[0][0]
+    assert first.kind == "region" and first.where == f"picture region row {row} of 3, column {column} of 4"
+    assert first.change == pytest.approx(np.expm1(0.2), rel=0.05)
+
+
 def test_faults_are_ordered_by_their_excess():
     faults, _ = find_faults(synthetic(0.1), [str(k) for k in range(24)])
     of = ScaleTolerance()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,10 @@ def test_frames_of_one_instant_stand_together() -> None:
     for wrong in ([a], [a, a], []):
         with pytest.raises(FormatError, match="two or more cameras of different names"):
             join_cameras(wrong)
+    folder = Path("a folder")
+    for recording, where in ((a, "car/a"), (dataclasses.replace(a, root=folder), "a folder")):
+        with pytest.raises(FormatError, match=f"^{where}: cameras: found a, expected"):
+            join_cameras([recording])
 
 
 def test_a_frame_belongs_to_one_instant() -> None:
