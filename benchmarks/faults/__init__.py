@@ -4,6 +4,8 @@ A row is (function, text that is there once, text that takes its place); a fourt
 answer. Rows come from what was once not noticed, and from what the rules of ``mutants.py --sweep`` drew.
 """
 
+from pathlib import Path
+
 from faults import (
     commanding,
     compiled,
@@ -43,10 +45,20 @@ _STORED |= dict.fromkeys(("pipeline", "records", "stages", "validation", "experi
 _STORED |= {"data": "data/test_stored_readings", "viz": "viz/test_drawn_figures"}
 
 
+#: Packages whose public functions are called in every row of the contract.
+_IN_CONTRACT = ("alignment", "geometry", "metrics", "pipeline", "stages", "validation")
+
+_ROOT = Path(__file__).resolve().parents[2]
+
+
 def _tests_of(module: str) -> list[str]:
-    stored = _STORED.get(module.split(".", maxsplit=1)[0])
-    own = [*_NAMED.get(module, []), *([f"tests/{stored}.py"] if stored else [])]
-    return list(dict.fromkeys([*own, *covering.TESTS.get(module, [])]))
+    """The module's own tests, those of stored values, further ones that run its lines, and then all of its package."""
+    package = module.split(".", maxsplit=1)[0]
+    stored = _STORED.get(package)
+    own = [*_NAMED.get(module, []), *([f"tests/{stored}.py"] if stored else []), *covering.TESTS.get(module, [])]
+    contract = ["tests/test_contract.py"] if package in _IN_CONTRACT else []
+    rest = sorted(path.relative_to(_ROOT).as_posix() for path in (_ROOT / "tests" / package).glob("test_*.py"))
+    return list(dict.fromkeys([*own, *contract, *rest]))
 
 
 #: Module → the tests that are to notice: its own, then others that run its lines.
