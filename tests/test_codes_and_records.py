@@ -72,6 +72,13 @@ def test_records_are_joined_in_order_and_cut_into_chunks():
         pytree.collate([camera(1), Pose(torch.eye(3)[None], torch.zeros(1, 3))])
 
 
+def test_a_record_moves_by_position_and_by_name():
+    one = camera(1)
+    for moved in (one.to(torch.float64), one.to(dtype=torch.float64), one.to("cpu", torch.float64, non_blocking=True)):
+        assert moved.f.dtype == moved.c.dtype == torch.float64 and torch.equal(moved.f.float(), one.f)
+    assert one.to("cpu").f.dtype == torch.float32 and one.to(device="meta").c.device.type == "meta"
+
+
 def test_an_interval_is_that_of_inverse_depth():
     depth, sigma = torch.tensor([2.0, 2.0, torch.nan]), torch.tensor([0.2, 1.5, 0.1])
     low, high = depth_interval(depth, sigma)

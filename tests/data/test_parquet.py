@@ -66,6 +66,11 @@ def test_damaged_structures_raise(damaged):
         list(thrift.iter_list_structs(damaged, 0, 4))
 
 
+def test_a_byte_and_a_double_in_thrift():
+    said = bytes([0x13, 100, 0x17, *8 * [9], 0x13, 7, 0])
+    assert thrift.parse_struct(b"??" + said, 2) == ({1: 100, 2: None, 3: 7}, 2 + len(said))
+
+
 def test_a_structure_in_thrift():
     said = bytes([0x15, 0x04, 0x18, 2, 104, 105, 0x19, 0x25, 1, 4, 0x11, 0x1C, 0x15, 5, 0, 0])
     assert thrift.parse_struct(said, 0) == ({1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}, len(said))

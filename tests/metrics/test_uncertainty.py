@@ -58,6 +58,11 @@ def test_bias_is_that_of_the_range_and_small_bins_are_left_out():
     assert measure_uncertainty(far)["worst_bias"] == max(abs(b.bias) for b in bins)
     gross = far.replace(depth=torch.where(torch.arange(20000) % 10 == 0, 100.0, far.depth))
     assert range_bias(gross)[2].mean > 0.1 > range_bias(gross)[2].bias
+    one = torch.tensor([2.2, 2.2, 2.2, 2.2], dtype=torch.float64)
+    few = far[:4].replace(true_depth=one, depth=one * torch.tensor([0.5, 0.9, 1.1, 9.0]).double())
+    (only,) = range_bias(few, min_answers=4)
+    assert only.n == 4
+    assert only.mean == pytest.approx((-0.5 - 0.1 + 0.1 + 1) / 4) and only.bias == pytest.approx(-0.1)
 
 
 def estimate(seed, stated=1.0, common=0.0, n=4000):
