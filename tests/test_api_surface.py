@@ -1,4 +1,5 @@
 """The public surface: what users may rely on, held with signatures in ``api_surface.json``.
+
 ``DHTORCH_STORE=1 pytest tests/test_api_surface.py`` stores it anew, after a change that is meant.
 """
 

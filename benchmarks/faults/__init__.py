@@ -45,7 +45,7 @@ _STORED |= dict.fromkeys(("pipeline", "records", "stages", "validation", "experi
 _STORED |= {"data": "data/test_stored_readings", "viz": "viz/test_drawn_figures"}
 
 
-#: Packages whose public functions are called in every row of the contract.
+#: Packages with public functions that ``test_contract.py`` calls.
 _IN_CONTRACT = ("alignment", "geometry", "metrics", "pipeline", "stages", "validation")
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -61,5 +61,5 @@ def _tests_of(module: str) -> list[str]:
     return list(dict.fromkeys([*own, *contract, *rest]))
 
 
-#: Module → the tests that are to notice: its own, then others that run its lines.
+#: Module → the tests that are to notice, in the order in which they run.
 TESTS: dict[str, list[str]] = {module: _tests_of(module) for module in dict.fromkeys([*_NAMED, *covering.TESTS])}

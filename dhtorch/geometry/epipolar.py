@@ -168,8 +168,15 @@ def _check_two_views(
     where: str, uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose
 ) -> None:
     """Raise a ValueError unless pixels (B, N, 2) of both views, cameras and pose have the same B and N."""
-    check(where, uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
-    check(where, uv_0=(uv_0, "B N 2"), R=(T_1_from_0.R, "B 3 3"), t=(T_1_from_0.t, "B 3"))
+    check(
+        where,
+        uv_0=(uv_0, "B N 2"),
+        uv_1=(uv_1, "B N 2"),
+        f0=(camera_0.f, "B 2"),
+        f1=(camera_1.f, "B 2"),
+        R=(T_1_from_0.R, "B 3 3"),
+        t=(T_1_from_0.t, "B 3"),
+    )
 
 
 def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:

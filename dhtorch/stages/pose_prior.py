@@ -103,9 +103,16 @@ def check_pose_prior(
     Gradient: R and t to the given pose; whether it is used, its covariance and the rest carry none.
     Cost: linear in N.
     """
-    check("check_pose_prior", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(prior.T_1_from_0.R, "B 3 3"))
-    check("check_pose_prior", R=(prior.T_1_from_0.R, "B 3 3"), t=(prior.T_1_from_0.t, "B 3"), cov=(prior.cov, "B 6 6"))
-    check("check_pose_prior", t=(prior.T_1_from_0.t, "B 3"), f_1=(camera_1.f, "B 2"), fit=(fit.code, "B"))
+    check(
+        "check_pose_prior",
+        xyz=(samples.xyz, "B N 3"),
+        uv_1=(tracks.uv_1, "B N 2"),
+        R=(prior.T_1_from_0.R, "B 3 3"),
+        t=(prior.T_1_from_0.t, "B 3"),
+        cov=(prior.cov, "B 6 6"),
+        f_1=(camera_1.f, "B 2"),
+        code=(fit.code, "B"),
+    )
     T = prior.T_1_from_0.to(samples.xyz.dtype)
     N = samples.uv.shape[1]
     with torch.no_grad():

@@ -201,8 +201,13 @@ def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: Po
 
     Gradient: to depth, sigma, parallax and residual; zero beyond the limits and where there is no answer.
     """
-    check("score_features", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
-    check("score_features", gate=(estimate.gate, "B N"), inlier=(fit.inlier, "B N"))
+    check(
+        "score_features",
+        gate=(estimate.gate, "B N"),
+        uv=(samples.uv, "B N 2"),
+        valid=(tracks.valid, "B N"),
+        inlier=(fit.inlier, "B N"),
+    )
     terms = [(estimate.residual_px, SCORE_RESIDUAL_PX), (tracks.error, SCORE_ROUND_TRIP_PX)]
     expected, stated = _expected_error(estimate, terms)
     evidence = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)

@@ -94,16 +94,15 @@ def check_captures_once():
 
     def check_once(capture):
         window = capture_check._read_window(capture, {})
-        parts = (window, capture.poses, capture.number, capture.times, capture.depth_unit, capture.sparse, len(capture))
+        parts = (list(window), window, capture.poses, capture.depth_unit, capture.sparse, len(capture))
         total = hashlib.sha256()
         for x in _pytree.tree_leaves(parts):
-            numbers = isinstance(x, torch.Tensor)
-            total.update(
-                repr((x.shape, x.dtype) if numbers else x).encode() + (x.numpy().tobytes() if numbers else b"")
-            )
+            is_tensor = isinstance(x, torch.Tensor)
+            total.update(repr((x.shape, x.dtype) if is_tensor else x).encode())
+            total.update(x.numpy().tobytes() if is_tensor else b"")
         key = total.digest()
         if key not in checks:
-            checks[key] = examine(capture)
+            checks[key] = examine(capture, window)
         found = checks[key]
         usable = replace(capture, poses=None) if found.poses_refuted else capture
         return replace(found, recording=usable)

@@ -10,8 +10,8 @@ from support.digests import dump
 
 
 def stored_values(file, found=None, names=None):
-    """Name -> stored value; with ``DHTORCH_STORE`` those of ``found`` are stored first, and of ``names`` no others
-    stay."""
+    """Name -> stored value. With ``DHTORCH_STORE`` set, the values of ``found`` replace the stored ones first, and what
+    is not in ``names`` is removed."""
     values = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     if found and os.environ.get("DHTORCH_STORE"):
         values |= found
