@@ -28,6 +28,7 @@ import learning_tables
 import mutants
 import pose_tables
 import reader_tables
+import reproduce
 import speed_tables
 from cells import number, percent, table
 
@@ -51,10 +52,25 @@ DEFAULT_ROOM = "synthetic_walk_2"
 COMPARED = ("map", "auto_2", "auto")
 
 
-@cache
+#: Names of the result files that the part being written has read.
+_names_read: set[str] = set()
+
+
 def read_json(path: Path) -> Any:
-    """Content of a result file, which nobody changes: many tables are of the same files."""
+    """Content of a result file, which must not be changed: many tables are of the same files."""
+    _names_read.add(path.stem)
+    return _read_json(path)
+
+
+@cache
+def _read_json(path: Path) -> Any:
     return json.loads(path.read_text())
+
+
+def heading(method: str, result: str) -> str:
+    """Heading of a method's column: ``map`` without the test of misaligned depth is that of release 1, ``map_1``."""
+    options = read_json(RESULTS / f"{result}.json")["config"]["experiment"]["methods"].get(method)
+    return "`map` of release 1" if method == "map" and options and not options.get("verify") else f"`{method}`"
 
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
@@ -160,7 +176,7 @@ def comparison() -> str:
         bars = f"{BOUND[name]} {one:g}" if one == many else f"{BOUND[name]} {one:g} / {many:g}"
         cells = [f"{summary[f'{m}.{name}']['value']:.3f}" for m in COMPARED]
         rows.append([NUMBER[name], *cells, bars])
-    return table(["number", *(f"`{m}`" for m in COMPARED), "bar"], rows)
+    return table(["number", *(heading(m, "method_comparison") for m in COMPARED), "bar"], rows)
 
 
 def chosen_views(*results: str) -> str:
@@ -240,14 +256,16 @@ def by_scene(comparison: str) -> str:
             if m in methods
         ]
         rows.append([*cells, " / ".join(map(number, ratios))])
-    several, compared = (" / ".join(f"`{m}`" for m in group if m in methods) for group in (shown, COMPARED))
+    several, compared = (
+        " / ".join(heading(m, comparison) for m in group if m in methods) for group in (shown, COMPARED)
+    )
     heads = ["scene", "candidates", f"coverage, {several}", "median error", f"ratio at equal coverage, {compared}"]
     return table(heads, rows)
 
 
 def archived_answers() -> dict[str, dict[str, Any]]:
     """Result files with a verdict: name → result."""
-    results = {path.stem: read_json(path) for path in sorted(RESULTS.glob("*.json"))}
+    results = {path.stem: _read_json(path) for path in sorted(RESULTS.glob("*.json"))}
     return {name: result for name, result in results.items() if isinstance(result, dict) and result.get("verdict")}
 
 
@@ -259,6 +277,7 @@ def with_others(names: Sequence[str]) -> list[dict[str, Any]]:
         for name in names
         for other in (name, *(k for k in answers if answers[k]["experiment"] == answers[name]["experiment"]))
     ]
+    _names_read.update(wanted)
     return [answers[name] for name in dict.fromkeys(wanted)]
 
 
@@ -331,7 +350,9 @@ def how_good() -> str:
     where = " and ".join(sorted({r["processor"] for r, _ in timed}))
     rows.append([f"ms a reference view of 640×480, one thread ({where})", *(f"{r[s]:,.0f}" for r, s in timed)])
     rows[-1][-1] = "as `fused`"
-    return table(["median over eleven scenes", *(f"`{m}`" for m in (*README_METHODS, "dense"))], rows)
+    return table(
+        ["median over eleven scenes", *(heading(m, "method_comparison") for m in (*README_METHODS, "dense"))], rows
+    )
 
 
 def untouched() -> str:
@@ -339,7 +360,7 @@ def untouched() -> str:
     samples, maps = (read_json(RESULTS / f"{name}.json") for name in ("untouched", "untouched_dense"))
     scenes = {row["scene"] for row in samples["rows"]}  # the other file has stress rooms as well
     maps["rows"] = [row for row in maps["rows"] if row["scene"] in scenes]
-    columns = [(samples, m, f"`{m}`") for m in UNTOUCHED_METHODS]
+    columns = [(samples, m, heading(m, "untouched")) for m in UNTOUCHED_METHODS]
     columns += [(maps, m, words) for m, words in UNTOUCHED_MAPS.items()]
     rows = []
     for label, is_room in (("real", False), ("rooms", True)):
@@ -347,8 +368,18 @@ def untouched() -> str:
             cells = [percent(_median_over_scenes(result, method, key, is_room)) for result, method, _ in columns]
             rows.append([f"{label}: {GOOD[key]}", *cells])
     n = [len(_scenes_of(samples, UNTOUCHED_METHODS[0], is_room)) for is_room in (False, True)]
-    about = f"medians over {n[0]} real scenes, {n[1]} rooms; commit {samples['meta']['git']}"
-    return table([about, *(words for *_, words in columns)], rows)
+    about = f"medians over {n[0]} real scenes, {len(STUDIO_PAIRS)} of them studio pairs, and {n[1]} rooms"
+    about += f"; commit {samples['meta']['git']}"
+    moving = [row_of("method_comparison", scene, "fused") for scene in MOVING_CAMERAS]
+    values = ([row[key] for row in moving] for key in ("coverage", "median_rel"))
+    coverage, error = (f"{percent(min(v))} to {percent(max(v))}" for v in values)
+    note = (
+        f"The medians of the real scenes are those of studio pairs ({', '.join(STUDIO_PAIRS)}): sharp and still.\n"
+        f"Moving cameras are harder: on {', '.join(MOVING_CAMERAS)}, where\n"
+        f"constants were chosen, `fused` has a coverage of {coverage} and a median error of {error}\n"
+        "(`python benchmarks/reproduce.py method_comparison`)."
+    )
+    return f"{table([about, *(words for *_, words in columns)], rows)}\n\n{note}"
 
 
 def _scenes_of(result: dict[str, Any], method: str, is_room: bool) -> list[dict[str, Any]]:
@@ -381,6 +412,9 @@ GOOD = {
 #: Rows, methods of samples, and maps, in README's table.
 UNTOUCHED_KEYS = ("coverage", "median_rel", "p90_rel", "coverage_at_5")
 UNTOUCHED_METHODS = ("paper", "map", "auto", "fused")
+#: Real scenes of that table that are pairs of a studio, and hand-held or head-worn recordings beside them.
+STUDIO_PAIRS = ("Art", "Books", "Dolls", "Moebius")
+MOVING_CAMERAS = ("holo_a", *(f"7s_redkitchen_{k}00" for k in ("0", "2", "4", "6")), "tum_fr1_desk9")
 UNTOUCHED_MAPS = {"dense": "map of `fused`", "sgbm": "OpenCV SGBM", "bilateral": "filled sensor"}
 
 DENSE_KEY = {"coverage": "answered"}
@@ -866,6 +900,7 @@ TABLES |= {name: partial(with_verdicts, TABLES[name], *results) for name, result
 
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
+    _names_read.add(name)
     tables = layouts.layout_tables(result_files.read_result(RESULTS / f"{name}.json"))
     if not tables:
         raise ValueError(f"{RESULTS / name}.json: found an experiment without tables of its own, expected a known one")
@@ -902,7 +937,20 @@ def fill(page: Path) -> str:
     names, ends = MARKER.findall(whole), whole.count("<!-- end -->")
     if len(names) != ends:
         raise ValueError(f"{page}: found {len(names)} markers and {ends} ends, expected as many of each")
-    return BLOCK.sub(lambda m: f"<!-- {m[1]} -->\n{maker(m[1])()}\n<!-- end -->", whole)
+    return BLOCK.sub(lambda m: f"<!-- {m[1]} -->\n{_written(m[1])}\n<!-- end -->", whole)
+
+
+def _written(name: str) -> str:
+    """The part of a page that a marker names, and a note on its files with the settings of an earlier release."""
+    _names_read.clear()
+    part = maker(name)()
+    if name == "make: experiments":  # of docs/hooks.py, with every archived answer
+        _names_read.update(archived_answers())
+    old = sorted(_names_read & reproduce.OUTDATED)
+    files = ", ".join(f"`{each}.json`" for each in old)
+    note = f"\n\n*Made with the settings of an earlier release, not of this one: {files}. "
+    note += f"`python benchmarks/reproduce.py {' '.join(old)}` makes them again.*"
+    return part + note if old else part
 
 
 def pages() -> list[Path]:

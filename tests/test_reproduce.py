@@ -12,6 +12,7 @@ from dhtorch.runtime import results as result_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import readme
 import reproduce
 import speed_tables
 
@@ -27,6 +28,34 @@ def test_every_result_has_a_command_and_every_command_its_result():
 @pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS))
 def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
     assert (reproduce.check(name) == []) == (name not in reproduce.OUTDATED)
+
+
+@pytest.mark.parametrize(
+    ("part", "files"),
+    [
+        ("kornia twin", {"kornia_twin"}),
+        ("validate", {"validate_study", "validate_study_streams", "validate_study_unseen"}),
+        ("results part_ablation", {"part_ablation"}),
+        ("questions", reproduce.OUTDATED),
+        ("make: experiments", reproduce.OUTDATED),
+        ("track chain", set()),
+        ("pin", set()),
+    ],
+)
+def test_a_table_from_a_file_with_earlier_settings_has_a_note_that_names_it(part, files):
+    name = re.escape(part)
+    blocks = [
+        m for page in PAGES for m in re.findall(rf"<!-- {name} -->(.*?)<!-- end -->", (REPO / page).read_text(), re.S)
+    ]
+    assert blocks, "no page has this part"
+    for block in blocks:
+        notes = re.findall(r"\*Made with the settings of an earlier release, not of this one: (.*?)\. ", block)
+        assert {n for note in notes for n in re.findall(r"`(\w+)\.json`", note)} == set(files)
+
+
+def test_a_column_of_the_first_release_is_labelled():
+    assert readme.heading("map", "untouched") == readme.heading("map", "method_comparison") == "`map` of release 1"
+    assert readme.heading("map", "track_chain") == "`map`" and readme.heading("paper", "untouched") == "`paper`"
 
 
 @pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS.keys() - reproduce.OUTDATED))
