@@ -374,9 +374,9 @@ def untouched() -> str:
     values = ([row[key] for row in moving] for key in ("coverage", "median_rel"))
     coverage, error = (f"{percent(min(v))} to {percent(max(v))}" for v in values)
     note = (
-        f"The medians of the real scenes are those of studio pairs ({', '.join(STUDIO_PAIRS)}): sharp and still.\n"
-        f"Moving cameras are harder: on {', '.join(MOVING_CAMERAS)}, where\n"
-        f"constants were chosen, `fused` has a coverage of {coverage} and a median error of {error}\n"
+        f"The medians of the real scenes are those of studio pairs ({', '.join(STUDIO_PAIRS)}): sharp and still. "
+        f"Moving cameras are harder: on {', '.join(MOVING_CAMERAS)}, where constants were chosen, `fused` "
+        f"has a coverage of {coverage} and a median error of {error} "
         "(`python benchmarks/reproduce.py method_comparison`)."
     )
     return f"{table([about, *(words for *_, words in columns)], rows)}\n\n{note}"
