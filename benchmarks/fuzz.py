@@ -29,8 +29,8 @@ from support import byte_damage, damage_harness, format_damage  # noqa: E402
 from support.captures_by_format import SAMPLES as CAPTURES  # noqa: E402
 from support.other_inputs import OTHER_INPUTS  # noqa: E402
 
-from dhtorch.data.io.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 from dhtorch.runtime import storage  # noqa: E402
+from dhtorch.runtime.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 
 SAMPLES = CAPTURES | OTHER_INPUTS
 SOME, MANY = 150, 350  # cases of every format or other input

@@ -83,7 +83,6 @@ data.intrinsics data/tum data/rlds data/lerobot data/azure_kinect data/readers
 data.io.decode data/decompression_bombs data/posed_images data/orientation cli/pin_command data/plausibility
 data.io.decode data/image_folders data/tum
 data.io.decode data/decompression_bombs data/corrections
-data.io.safe_open data/tum data/rh20t data/ca1m data/readers data/simulator_hdf5
 data.laser data/ca1m data/arkitscenes robustness/damaged_files
 data.members data/image_folders cli/inspect
 data.models data/models cli/scale_command
@@ -275,6 +274,7 @@ runtime.numerics runtime/numerics transforms/shown integrations/lerobot_package 
 runtime.output_folder cli/fetch test_clients cli/align_command extract/policy_columns
 runtime.ply data/models viz/plots viz/viewer cli/process_capture
 runtime.results cli/resume cli/exit cli/run extract/policy_columns
+runtime.safe_open data/tum data/rh20t data/ca1m data/readers data/simulator_hdf5
 runtime.storage data/models cli/exit extract/policy_columns extract/written_rows test_clients extract/shards
 stages.backproject ops/compiled stages/inverse_variance stages/guided_search stages/contradicted stages/misalignment
 stages.features geometry/kornia

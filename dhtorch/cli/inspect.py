@@ -28,13 +28,13 @@ from dhtorch.data import FormatError
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
 from dhtorch.data.io import decode as files
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.geometry.sensor_noise import sensor_of_format
 from dhtorch.pipeline.picture_matching import spread_evenly
+from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder

@@ -19,7 +19,6 @@ from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
 from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.readers import (
     apc,
     arkitscenes,
@@ -51,6 +50,7 @@ from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.data.unread import report_unread
 from dhtorch.runtime import console
 from dhtorch.runtime.numerics import standard_numerics
+from dhtorch.runtime.safe_open import record_opened_files, restrict_links
 
 __all__ = [
     "FORMATS",

@@ -28,13 +28,13 @@ from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.codecs.tiff import read_tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError
-from dhtorch.data.io.safe_open import check_link, modification_time_ns, restrict_links
 from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import check_orientation
 from dhtorch.data.units import UNIT_METRES, DepthUnit, parse_unit
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.safe_open import check_link, modification_time_ns, restrict_links
 
 _SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
 

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
-from dhtorch.data.io.safe_open import open_regular
+from dhtorch.runtime.safe_open import open_regular
 
 _MAX_MEMBERS = 2_000_000
 _LOCAL_HEADER_BYTES = 30  # bytes before the name

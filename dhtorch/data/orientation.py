@@ -15,12 +15,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.data.convert import rot90_camera, rot90_image
-from dhtorch.data.io.safe_open import FormatError, restrict_links
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import SAME_ORIENTATION, StoredSizes, describe_mismatch
 from dhtorch.geometry import filters
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.records import Frame
+from dhtorch.runtime.safe_open import FormatError, restrict_links
 
 #: What is done to a stored map, by symmetry.
 SYMMETRY_NAMES: Final = (

@@ -15,13 +15,13 @@ from typing import ClassVar, TypeVar, overload
 import torch
 from torch import Tensor
 
-from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.stored_sizes import StoredSizes, check_orientation
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.numerics import standard_numerics
+from dhtorch.runtime.safe_open import record_opened_files, restrict_links
 
 _Item = TypeVar("_Item")
 

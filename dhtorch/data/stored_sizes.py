@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from dhtorch.data.io.safe_open import FormatError
+from dhtorch.runtime.safe_open import FormatError
 
 #: EXIF orientation → symmetry that turns the stored picture upright.
 EXIF_SYMMETRIES: Final = {1: 0, 2: 4, 3: 2, 4: 6, 5: 7, 6: 1, 7: 5, 8: 3}

@@ -14,9 +14,9 @@ from torch.utils.data import Dataset
 
 from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import modification_time_ns
 from dhtorch.extract.columns import KEY_COLUMNS
 from dhtorch.extract.shards import read_shard_metadata, shard_files
+from dhtorch.runtime.safe_open import modification_time_ns
 from dhtorch.transforms.sample_access import get_value
 
 #: Maximum number of row groups cached in a process.

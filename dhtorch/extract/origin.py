@@ -11,11 +11,11 @@ import numpy as np
 
 from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
 from dhtorch.data.io import decode as files
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.data.readers.lerobot_meta import LeRobotEpisodes, LeRobotMeta, read_lerobot_episodes, read_lerobot_meta
 from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
+from dhtorch.runtime import safe_open as doors
 
 #: Rows of one Arrow table in memory.
 TABLE_GROUP_ROWS = 8

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import names
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
@@ -33,6 +32,7 @@ from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, i
 from dhtorch.extract.origin import SOURCE_CARD, DatasetSource, LeRobotSource
 from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
 from dhtorch.extract.targets import MapCounts, Row
+from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import is_whole
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
-from dhtorch.data.io.safe_open import open_regular
+from dhtorch.runtime.safe_open import open_regular
 
 #: First bytes of a Matroska file: the identifier of its EBML header.
 MATROSKA_SIGNATURE: Final = b"\x1a\x45\xdf\xa3"

@@ -22,7 +22,7 @@ from dhtorch.data.codecs.bag_messages import (
     make_topic,
 )
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.data.io.safe_open import open_regular
+from dhtorch.runtime.safe_open import open_regular
 
 #: First and last bytes of a file.
 MCAP_SIGNATURE: Final = b"\x89MCAP0\r\n"

@@ -21,7 +21,7 @@ import numpy as np
 
 from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
-from dhtorch.data.io.safe_open import check_memory, open_regular
+from dhtorch.runtime.safe_open import check_memory, open_regular
 
 #: Largest size of a header in bytes.
 _MAX_HEADER_BYTES = 12_288

@@ -15,7 +15,7 @@ import numpy as np
 
 from dhtorch.data.codecs import thrift
 from dhtorch.data.io.decode import MAX_FILE_BYTES, MAX_TEXT_BYTES, FormatError, import_optional
-from dhtorch.data.io.safe_open import (
+from dhtorch.runtime.safe_open import (
     MAX_MEMORY_BYTES,
     MAX_MEMORY_RATIO,
     modification_time_ns,

@@ -19,7 +19,6 @@ import numpy as np
 
 from dhtorch.data.codecs.npy import parse_npy_header
 from dhtorch.data.io import decode as files
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.pickled_arrays import (
     PERMITTED_CALLS,
@@ -31,6 +30,7 @@ from dhtorch.data.pickled_arrays import (
     array_from_bytes,
     check_scalar,
 )
+from dhtorch.runtime import safe_open as doors
 
 _MAX_PICKLE_BYTES: Final = 128_000_000
 _MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle

@@ -21,7 +21,7 @@ from dhtorch.data.codecs.bag_messages import (
     make_topic,
 )
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.data.io.safe_open import open_regular
+from dhtorch.runtime.safe_open import open_regular
 
 #: First bytes of a bag.
 BAG_SIGNATURE: Final = b"#ROSBAG V2.0\n"

@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 from dhtorch.data.codecs.bag_messages import HEAD_BYTES, IndexedMessage, MessagePlace, Topic, make_topic
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.data.io.safe_open import open_regular
+from dhtorch.runtime.safe_open import open_regular
 
 #: First bytes of a database.
 SQLITE_SIGNATURE: Final = b"SQLite format 3\0"

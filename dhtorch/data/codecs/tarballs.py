@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.data.io.safe_open import open_regular, unreadable_error
+from dhtorch.runtime.safe_open import open_regular, unreadable_error
 
 _BLOCK_BYTES = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dhtorch.data.io.decode import MAX_DEFLATE_RATIO, MAX_PIXELS, FormatError, import_optional, read_bytes
-from dhtorch.data.io.safe_open import check_memory
+from dhtorch.runtime.safe_open import check_memory
 
 _TAG_VALUE_BYTES = {
     1: 1,

@@ -21,7 +21,7 @@ import numpy as np
 
 from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count, read_display_symmetry
 from dhtorch.data.io.decode import FormatError, import_optional
-from dhtorch.data.io.safe_open import modification_time_ns, open_regular
+from dhtorch.runtime.safe_open import modification_time_ns, open_regular
 
 _MAX_VIDEO_PIXELS = 36_000_000  # pixels, 8K; a decoder holds up to 17 frames
 _MAX_FRAMES = 10_000_000

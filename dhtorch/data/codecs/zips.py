@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import check_memory
+from dhtorch.runtime.safe_open import check_memory
 
 _END_RECORD, _ZIP64_LOCATOR, _ZIP64_END = b"PK\x05\x06", b"PK\x06\x07", b"PK\x06\x06"
 _END_RECORD_BYTES, _ZIP64_LOCATOR_BYTES, _ZIP64_END_BYTES = 22, 20, 56

@@ -1,7 +1,7 @@
 """Decoding of images, tables, text and JSON: file bytes -> numpy arrays or Python values.
 
 Lengths and headers are checked *before* decoding. Any defect of a file raises :class:`FormatError`: one line with the
-file, the field, what was found and what was expected. Files are opened by :mod:`dhtorch.data.io.safe_open`.
+file, the field, what was found and what was expected. Files are opened by :mod:`dhtorch.runtime.safe_open`.
 
 Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 """
@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from dhtorch.data.io.safe_open import FormatError, check_memory, open_regular, unreadable_error
 from dhtorch.geometry.no_depth import NO_DEPTH_CODES
+from dhtorch.runtime.safe_open import FormatError, check_memory, open_regular, unreadable_error
 
 #: Largest number of pixels of an image, above that of all supported cameras; larger headers are damaged or hostile.
 MAX_PIXELS = 64_000_000

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import check_regular_file
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera
 from dhtorch.runtime import storage
 from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
+from dhtorch.runtime.safe_open import check_regular_file
 
 #: A model point is seen in a picture unless another one is nearer by this fraction within a cell of so many cells
 #: across. Source: origin not recorded.

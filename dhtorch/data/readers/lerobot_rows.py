@@ -9,9 +9,9 @@ import numpy as np
 
 from dhtorch.data.codecs.parquet import read_cell, read_columns
 from dhtorch.data.io import decode as files
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta
+from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime.console import format_count
 
 #: Columns of ``dhtorch enrich``: frame number and time (s) in the capture that was enriched. Source: robot_target.

@@ -21,10 +21,10 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data.codecs import video
 from dhtorch.data.io import decode as files
-from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
+from dhtorch.runtime import safe_open as doors
 
 _METADATA_START = b'{"intrinsicMatrix"'
 _TAIL_BYTES = 1 << 20  # bytes at the end of the file that are searched for the intrinsics

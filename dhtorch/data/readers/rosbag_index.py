@@ -22,8 +22,8 @@ from dhtorch.data.codecs.bag_messages import (
 )
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import open_regular
 from dhtorch.data.readers.rosbag_transforms import TransformTree
+from dhtorch.runtime.safe_open import open_regular
 
 _IMAGE_TYPES: Final = {"sensor_msgs/Image": False, "sensor_msgs/CompressedImage": True}  # type → whether compressed
 _CODINGS: Final = ("cdr", "ros1")

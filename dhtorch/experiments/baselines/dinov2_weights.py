@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.data.io.safe_open import FormatError
+from dhtorch.runtime.safe_open import FormatError
 
 #: Width of an attention head in every published DINOv2 network. Source: derived, 384 / 6 = 768 / 12 = 1024 / 16.
 HEAD_WIDTH = 64

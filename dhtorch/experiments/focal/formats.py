@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from dhtorch.data import scenes_root
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.experiments.focal import ddff12, fod500, image_folder
 from dhtorch.experiments.focal.stacks import FocalStacks
+from dhtorch.runtime.safe_open import restrict_links
 
 #: Name → reader, tried in this order; the first that recognises a folder reads it.
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}

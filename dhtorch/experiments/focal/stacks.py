@@ -14,10 +14,10 @@ from torch import Tensor
 from dhtorch.data.codecs import tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.pytree import Record, record
 from dhtorch.records import Camera
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.safe_open import restrict_links
 
 #: Largest size of the decoded images of one stack, bytes; guards against folders that are no focal stack.
 _MAX_STACK_BYTES = 2_000_000_000
