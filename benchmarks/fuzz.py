@@ -6,8 +6,9 @@ child under the law of docs/data.md: time, memory, writes, code.
     python benchmarks/fuzz.py --only lerobot_v2 --case 17                  # one case again
 
 Half of the cases are bytes damaged (``tests/support/byte_damage.py``), half are files taken apart and put together
-again with one thing changed (``tests/support/format_damage.py``). A case is known by its format, seed and number. Exit
-code 1 where one is neither valid data nor a FormatError in one line.
+again with one thing changed (``tests/support/format_damage.py``). A case is known by its format, seed and number.
+Before them, a pipe, a socket, a device, a folder and a file of 3 GiB stand in the place of each kind of file. Exit code
+1 where one is neither valid data nor a FormatError in one line.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,9 @@ def attack(name: str, numbers: Sequence[int], seed: int, stop: float) -> dict[st
         tempfile.TemporaryDirectory(prefix="dhtorch-fuzz-") as folder,
         damage_harness.sample(*SAMPLES[name], Path(folder)) as (good, outcome_of),
     ):
-        for number in numbers:
+        for number, what, want in _iter_cases(name, good, numbers, seed):
             if time.monotonic() > stop:
                 break
-            draw = random.Random(f"{name}/{seed}/{number}")
-            what, want = (byte_damage.mutate if number % 2 else format_damage.recode)(good, draw)
             outcome = outcome_of(want)
             counts[outcome.kind] += 1
             slowest, largest = max(slowest, outcome.seconds), max(largest, outcome.bytes / 2**20)
@@ -92,6 +91,17 @@ def attack(name: str, numbers: Sequence[int], seed: int, stop: float) -> dict[st
     print(f"{name:20} {counts.total():5} cases, {dict(counts)}, at most {slowest:.1f} s, {largest:.0f} MiB", flush=True)
     worst = {"slowest_s": round(slowest, 2), "largest_mib": round(largest)}
     return {"cases": counts.total(), "outcomes": dict(counts), **worst, "failures": failures}
+
+
+def _iter_cases(
+    name: str, good: byte_damage.Capture, numbers: Sequence[int], seed: int
+) -> Iterator[tuple[int, str, byte_damage.Capture]]:
+    """Number, description and files of each case; numbers below 0 are those of what is no file."""
+    if len(numbers) > 1 and name != "settings":  # these are the user's own
+        yield from ((~k, *case) for k, case in enumerate(byte_damage.iter_strange(good)))
+    for number in numbers:
+        draw = random.Random(f"{name}/{seed}/{number}")
+        yield number, *(byte_damage.mutate if number % 2 else format_damage.recode)(good, draw)
 
 
 if __name__ == "__main__":

@@ -201,7 +201,7 @@ def _read_meta(task: CompletionTask, path: Path) -> Row | None:
     if not all(is_whole(task.layout.file(task.folder, kind, path.stem)) for kind in task.layout.folders):
         return None
     try:
-        row: Row = storage.parse_strict_json(path.read_text(encoding="utf-8"))
+        row: Row = storage.parse_strict_json(storage.read_utf8(path))
         return row if row["key"] == task.shared["key"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -130,8 +130,7 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
     Raises:
         FormatError: no capture.
     """
-    if not path.exists():
-        raise FormatError(path, "path", "no such file or folder", "a capture")
+    doors.check_file_or_folder(path, "a capture")
     level = [path]
     for _ in range(_MAX_LEVELS + 1):
         inside = [

@@ -22,7 +22,8 @@ from dhtorch.experiments.protocol import Progress, Settings
 from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
-from dhtorch.runtime.output_folder import open_output_file
+from dhtorch.runtime.output_folder import is_whole, open_output_file
+from dhtorch.runtime.storage import read_utf8
 from dhtorch.viz.viewer import again, html, points, rrd
 from dhtorch.viz.viewer.exhibit import Exhibit
 
@@ -91,7 +92,7 @@ def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Pr
 def _read_data_root(folder: Path) -> str | None:
     """Data folder recorded beside a result, None where it no longer exists."""
     note = folder / DATA_ROOT_FILE
-    root = note.read_text(encoding="utf-8", errors="replace").strip() if note.is_file() else ""
+    root = read_utf8(note).strip() if is_whole(note) else ""
     return root if root and Path(root).exists() else None
 
 

@@ -50,7 +50,7 @@ from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.data.unread import report_unread
 from dhtorch.runtime import console
 from dhtorch.runtime.numerics import standard_numerics
-from dhtorch.runtime.safe_open import record_opened_files, restrict_links
+from dhtorch.runtime.safe_open import check_file_or_folder, record_opened_files, restrict_links
 
 __all__ = [
     "FORMATS",
@@ -176,8 +176,8 @@ def open_all(
         format = recognise(root, follow_links=follow_links)[0]
     elif format not in FORMATS:
         raise FormatError(root, "format", format, f"auto, {', '.join(FORMATS)}")
-    elif not root.exists():
-        raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
+    else:
+        check_file_or_folder(root, f"a {format} capture")
     corrections = Corrections.from_options(options)
     options = {name: value for name, value in options.items() if name not in Corrections.names()}
     read = FORMATS[format].read
@@ -251,8 +251,7 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
         FormatError: no such path, or a format that no reader recognises.
     """
     root = Path(root)
-    if not root.exists():
-        raise FormatError(root, "path", "no such file or folder", "a capture")
+    check_file_or_folder(root, "a capture")
     with restrict_links(None if follow_links else root):
         for name, reader in FORMATS.items():
             if evidence := reader.recognise(root):

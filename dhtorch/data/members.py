@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dhtorch.data.codecs.zips import check_zip_directory
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.data.io.decode import FormatError, read_bytes
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 _MAX_MEMBERS = 2_000_000
 _LOCAL_HEADER_BYTES = 30  # bytes before the name

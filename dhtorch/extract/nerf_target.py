@@ -56,7 +56,7 @@ class NerfstudioTarget:
         """As :meth:`DatasetTarget.own`."""
         files = [self._file(k, key) for key in self.views]
         try:
-            contents = [storage.parse_strict_json(file.read_text(encoding="utf-8")) for file in files]
+            contents = [storage.parse_strict_json(storage.read_utf8(file)) for file in files]
             summaries = [content["dhtorch"] for content in contents]
             if any(summary["key"] != self.key for summary in summaries):
                 return None

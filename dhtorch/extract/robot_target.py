@@ -189,6 +189,7 @@ class LeRobotTarget:
         """As :meth:`DatasetTarget.own`."""
         parquet = import_optional("pyarrow.parquet")
         try:
+            doors.check_regular_file(self.file(k))
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
             return summary if summary["key"] == self.key and all(map(is_whole, self._geometry_files(k))) else None

@@ -19,6 +19,7 @@ from dhtorch.extract.columns import Column, Row, arrow_schema, arrow_table
 from dhtorch.extract.plan import ShardSpec
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
+from dhtorch.runtime.safe_open import check_regular_file
 
 #: Key of the metadata that all shards share.
 _SHARED_METADATA_KEY = b"dhtorch"
@@ -109,6 +110,7 @@ def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         FormatError: no shard of dhtorch extract, or a damaged one.
     """
     parquet = import_optional("pyarrow.parquet")
+    check_regular_file(path)
     try:
         metadata = parquet.read_metadata(path).metadata or {}
         keys = (_SHARED_METADATA_KEY, _SHARD_METADATA_KEY)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dhtorch.runtime.file_lock import acquire_file_lock
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, describe_kind, read_bytes
 
 #: Name of the private folder.
 PRIVATE_FOLDER = ".dhtorch"
@@ -125,9 +126,12 @@ class OutputFolder:
 
     def owns(self, path: Path) -> bool:
         """Whether the regular file at ``path`` is as dhtorch wrote it; false for any other path."""
-        entries = self._entries.get(self._name(path), ())
         status = _read_status(path)
-        if not entries or status is None or not stat.S_ISREG(status.st_mode):
+        if status is None or not stat.S_ISREG(status.st_mode):
+            return False
+        known = self._entries.get(self._name(path), ())
+        entries = [each for each in known if each.size == _ANY_SIZE or each.size >= status.st_size]
+        if not entries:
             return False
         identity = FileIdentity.of(path)
         return any(entry.covers(identity) for entry in entries)
@@ -217,7 +221,8 @@ class OutputFolder:
     def _open_manifest(self) -> None:
         """Read the manifest; lines that are not valid, as of a torn write, are left out."""
         path = self.private / _MANIFEST
-        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        is_written = path.exists() and path.stat().st_size > 0
+        text = read_bytes(path, MAX_TEXT_BYTES).decode("utf-8", "replace") if is_written else ""
         self.is_unlisted = not text
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError, RecursionError):
@@ -286,9 +291,13 @@ def open_output_folder(
         home.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
-    for name in (_LOCK, _MANIFEST, _UNFINISHED):
-        if (home / name).is_symlink():
-            raise FileExistsError(f"{option}: found {home / name}, a link, expected dhtorch's own file; remove it")
+    for name, kind in ((_LOCK, stat.S_IFREG), (_MANIFEST, stat.S_IFREG), (_UNFINISHED, stat.S_IFDIR)):
+        status = _read_status(home / name)
+        if status is not None and stat.S_IFMT(status.st_mode) != kind:
+            found = f"{home / name}, {describe_kind(status.st_mode)}"
+            raise FileExistsError(
+                f"{option}: found {found}, expected dhtorch's own {describe_kind(kind)[2:]}; remove it"
+            )
     try:
         with acquire_file_lock(home / _LOCK, f"{option}: {path if only is None else only}"):
             opened._remove_unfinished()

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from dhtorch.runtime.safe_open import open_regular
+
+#: Largest size of a file, bytes. Source: chosen, eight million splats of 62 numbers.
+_MAX_PLY_BYTES = 2 << 30
+
+#: Bytes in which the header ends. Source: chosen, many times that of a splat with 62 properties.
+_MAX_HEADER_BYTES = 1 << 17
 
 #: Types of properties → numpy's, little-endian.
 _DTYPE_OF_PLY = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
@@ -39,18 +48,23 @@ def read_ply_vertices(path: Path) -> PlyVertices:
     """Vertices of a binary little-endian or text PLY file.
 
     Raises:
-        ValueError: another format, no vertices with x, y and z, or a truncated file.
-        OSError: no such file.
+        ValueError: no regular file, another format, no vertices with x, y and z, a truncated file, or one of more than
+            ``_MAX_PLY_BYTES``.
     """
-    head, end, body = path.read_bytes().partition(b"end_header\n")
-    lines = [line.strip() for line in head.decode("ascii", "replace").split("\n")]
-    is_ascii = "format ascii 1.0" in lines
-    if lines[0] != "ply" or not end or not (is_ascii or "format binary_little_endian 1.0" in lines):
-        raise ValueError(f"{path}: found another format, expected a PLY file, text or binary little-endian")
-    count, layout = _read_ply_layout(path, lines)
+    with open_regular(path) as stream:
+        head, end, _ = stream.read(_MAX_HEADER_BYTES).partition(b"end_header\n")
+        lines = [line.strip() for line in head.decode("ascii", "replace").split("\n")]
+        is_ascii = "format ascii 1.0" in lines
+        if lines[0] != "ply" or not end or not (is_ascii or "format binary_little_endian 1.0" in lines):
+            raise ValueError(f"{path}: found another format, expected a PLY file, text or binary little-endian")
+        count, layout = _read_ply_layout(path, lines)
+        if (size := os.fstat(stream.fileno()).st_size) > _MAX_PLY_BYTES:
+            raise ValueError(f"{path}: found {size} bytes, expected at most {_MAX_PLY_BYTES}")
+        stream.seek(len(head + end))
+        body = stream.read(size)
     kind = np.dtype(layout)
     if is_ascii:
-        rows = body.split(b"\n", count)
+        rows = body.split(b"\n", min(count, len(body)))
         try:
             vertex = np.array([tuple(map(float, row.split())) for row in rows[:count]], kind)
         except (ValueError, TypeError) as error:
@@ -70,11 +84,11 @@ def _read_ply_layout(path: Path, lines: Sequence[str]) -> tuple[int, list[tuple[
     count = None
     for words in (line.split() for line in lines):
         if words[:1] == ["element"]:
-            if count is not None or words[1:2] != ["vertex"] or not words[-1].isdigit():
+            if count is not None or words[1:2] != ["vertex"] or not (words[2:] and words[2].isdigit()):
                 break  # vertices come first; later elements (faces) are ignored
             count = int(words[2])
         elif words[:1] == ["property"] and count is not None:
-            if words[1] not in _DTYPE_OF_PLY or words[-1] in dict(layout):
+            if len(words) != 3 or words[1] not in _DTYPE_OF_PLY or words[-1] in dict(layout):
                 raise ValueError(f"{path}: found {' '.join(words)!r}, expected one number per vertex")
             layout.append((words[-1], _DTYPE_OF_PLY[words[1]]))
     if count is None or not {"x", "y", "z"} <= {name for name, _ in layout}:

@@ -20,7 +20,7 @@ from typing import Any
 
 from dhtorch.runtime import code_dependencies
 from dhtorch.runtime.output_folder import is_private
-from dhtorch.runtime.storage import dump_strict_json, parse_strict_json, replace_file, to_strict_json
+from dhtorch.runtime.storage import dump_strict_json, parse_strict_json, read_utf8, replace_file, to_strict_json
 
 _RESULT_SCHEMA = 1
 
@@ -192,14 +192,15 @@ def read_result(path: str | Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not JSON, not strict JSON, or not a valid result; the message names file and field.
+        ValueError: no regular file, too large, not strict JSON, or no valid result; the message names file and field.
     """
     path = Path(path)
     path = path / "result.json" if path.is_dir() else path
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"{path}: found no file, expected a result.json or a folder with one")
+    text = read_utf8(path)
     try:
-        result = parse_strict_json(path.read_text(encoding="utf-8"))
+        result = parse_strict_json(text)
     except ValueError as error:
         raise ValueError(f"{path}: found no strict JSON ({error}), expected a result") from error
     validate_result(result, str(path))
@@ -299,7 +300,7 @@ def check_same_run(file: Path, here: Mapping[str, Any], writer: str) -> None:
         FileExistsError: the file is damaged, or of other settings, data or code.
     """
     try:
-        there = parse_strict_json(file.read_text(encoding="utf-8"))
+        there = parse_strict_json(read_utf8(file))
         difference = "" if there["key"] == here["key"] else describe_difference(there, here)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         problem = f"{type(error).__name__} {error}"

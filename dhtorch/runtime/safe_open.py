@@ -1,7 +1,8 @@
 """Safe access to files for all readers: regular files inside the capture only, memory limits, and FormatError.
 
-Readers open every file with :func:`open_regular` and call :func:`check_memory` before decompressing or allocating
-memory whose size comes from a file, against decompression bombs.
+Readers open every file with :func:`open_regular`, or read it whole with :func:`read_bytes`, and call
+:func:`check_memory` before decompressing or allocating memory whose size comes from a file, against decompression
+bombs.
 """
 
 from __future__ import annotations
@@ -13,6 +14,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
+
+#: Largest size in bytes of an array or a file that is read whole.
+MAX_FILE_BYTES = 256_000_000
+#: Largest size in bytes of a table or a JSON document.
+MAX_TEXT_BYTES = 64_000_000
 
 #: Memory in bytes that opening a capture or reading one frame may take, whatever the size of the result.
 MAX_MEMORY_BYTES = 256 << 20
@@ -47,7 +53,7 @@ def open_regular(file: Path) -> Iterator[BinaryIO]:
         mode = file.stat().st_mode  # before opening: opening alone triggers some devices
         check_link(file)
         if not stat.S_ISREG(mode):
-            raise FormatError(file, "file", _FILE_KINDS.get(stat.S_IFMT(mode), "something else"), "a regular file")
+            raise FormatError(file, "file", describe_kind(mode), "a regular file")
         stream = os.fdopen(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
     except FormatError:
         raise
@@ -65,7 +71,45 @@ _FILE_KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a link",
+    stat.S_IFREG: "a file",
 }
+
+
+def describe_kind(mode: int) -> str:
+    """What a path is, of the mode in its status: a file, a folder, a pipe …"""
+    return _FILE_KINDS.get(stat.S_IFMT(mode), "something else")
+
+
+def check_file_or_folder(path: Path, expected: str) -> None:
+    """Check that a path leads to a regular file or a folder, before anything looks inside.
+
+    Raises:
+        FormatError: nothing is there, or a pipe, socket or device; ``expected`` ends the message.
+    """
+    try:
+        mode = path.stat().st_mode
+    except _OPEN_ERRORS as error:
+        found = error if isinstance(error, PermissionError) else "no such file or folder"
+        raise FormatError(path, "path", found, expected) from None
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise FormatError(path, "path", describe_kind(mode), expected)
+
+
+def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """All bytes of a file, at least one and at most ``limit``.
+
+    Raises:
+        FormatError: the file is missing, unreadable, no regular file, outside the capture, empty or too large.
+    """
+    with open_regular(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if not 0 < size <= limit:
+            raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
+        try:
+            return stream.read(size)  # of ``limit`` bytes a buffer would be allocated
+        except OSError as error:
+            raise unreadable_error(file, error) from None
 
 
 def check_regular_file(file: Path) -> int:
@@ -78,8 +122,9 @@ def check_regular_file(file: Path) -> int:
         return os.fstat(stream.fileno()).st_size
 
 
-#: The capture being read, whose links must not point outside it; None = no restriction.
-_restricted_root: ContextVar[Path | None] = ContextVar("capture", default=None)
+#: The capture or model being read, whose links must not point outside it, and the end of the message on one that does;
+#: None = no restriction.
+_restricted_root: ContextVar[tuple[Path, str] | None] = ContextVar("capture", default=None)
 
 
 #: Files opened so far, where they are recorded; None = they are not.
@@ -98,9 +143,9 @@ def record_opened_files() -> Iterator[set[Path]]:
 
 
 @contextmanager
-def restrict_links(root: Path | None) -> Iterator[None]:
+def restrict_links(root: Path | None, expected: str = "a file inside (follow_links=true allows)") -> Iterator[None]:
     """Context in which links below ``root`` that point outside it are refused; None = no restriction."""
-    token = _restricted_root.set(root)
+    token = _restricted_root.set(None if root is None else (root, expected))
     try:
         yield
     finally:
@@ -115,11 +160,11 @@ def is_inside(file: Path, root: Path) -> bool:
 
 def check_link(file: Path) -> None:
     """Raise FormatError for a link that points outside the capture being read (see :func:`restrict_links`)."""
-    root = _restricted_root.get()
-    if root is None or not file.is_relative_to(root):
+    restriction = _restricted_root.get()
+    if restriction is None or not file.is_relative_to(restriction[0]):
         return
-    if not is_inside(file, root):
-        raise FormatError(file, "link", "one to outside the capture", "a file inside (follow_links=true allows)")
+    if not is_inside(file, restriction[0]):
+        raise FormatError(file, "link", "one to outside the capture", restriction[1])
 
 
 def check_memory(file: Path, field: str, takes: int, value: object, requested: int = 0) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dhtorch.runtime import output_folder
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, open_regular, read_bytes
 
 #: Maximum nesting of lists and objects in a file, as they are traversed by recursion.
 _MAX_NESTING = 64
@@ -81,14 +82,16 @@ def parse_strict_json(text: str) -> Any:
 
 
 def read_utf8(path: str | Path) -> str:
-    """Text of a file in UTF-8.
+    """Text of a file in UTF-8, of at most ``MAX_TEXT_BYTES``.
 
     Raises:
-        OSError: no such file, or one that cannot be read.
-        ValueError: bytes that are no UTF-8; the message names the file.
+        FileNotFoundError: no such file.
+        ValueError: no regular file, empty, too large, or bytes that are no UTF-8; the message names the file.
     """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path}: found no such file, expected a file")
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return read_bytes(Path(path), MAX_TEXT_BYTES).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: found {error.reason} at byte {error.start}, expected text in UTF-8") from None
 
@@ -168,11 +171,15 @@ def _name_unfinished(path: Path) -> Path:
 
 
 def copy_file(source: str | Path, path: str | Path) -> Path:
-    """Copy a file atomically; does nothing if the source is missing or ``path`` already has its size."""
+    """Copy a file atomically; does nothing if the source is missing or ``path`` already has its size.
+
+    Raises:
+        FormatError: the source is a link to outside the capture being read.
+    """
     source, path = Path(source), Path(path)
     if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
         return path
-    with source.open("rb") as source_file, write_atomically(path) as file:
+    with open_regular(source) as source_file, write_atomically(path) as file:
         shutil.copyfileobj(source_file, file)
     return path
 

@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 import torch
+from support.byte_damage import STRANGE_FILES
 
 from dhtorch.data import FormatError
 from dhtorch.data.models import Similarity, network, read_model, scene_model, write_model
@@ -182,6 +183,53 @@ def test_points_that_are_no_file_are_named(tmp_path, kind):
     file.unlink()
     file.mkdir() if kind == "a folder" else os.mkfifo(file)
     with pytest.raises(FormatError, match=f"point_cloud.ply: file: found {kind}, expected a regular file"):
+        read_model(folder)
+
+
+LINKED = [
+    *(("nerfstudio", name) for name in ("transforms.json", "sparse_pc.ply", "images", "masks/0.png")),
+    *(("splat", name) for name in ("point_cloud/iteration_30000/point_cloud.ply", "cameras.json", "images/000000.png")),
+    *(("colmap txt", name) for name in ("cameras.txt", "points3D.txt", "images", "images/000000.png")),
+    *(("npz", "predictions.npz"), ("npz views", "000000.npz"), ("npz", "images/000000.png")),
+]
+
+
+def write_with_link(tmp_path, kind, name, elsewhere):
+    """A model with a link in the place of one of its files, or of a folder."""
+    _, folder = write(tmp_path, kind)
+    made.write_pictures(folder / "images")
+    if name.startswith("masks"):
+        (folder / "masks").mkdir()
+        (folder / name).write_bytes(b"not to be copied")
+        text = (folder / "transforms.json").read_text()
+        (folder / "transforms.json").write_text(
+            text.replace('{"file_path"', f'{{"mask_path": "{name}", "file_path"', 1)
+        )
+    (folder / name).rename(elsewhere)
+    (folder / name).symlink_to(elsewhere)
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "name"), LINKED)
+def test_a_link_out_of_a_model_is_not_followed(tmp_path, kind, name):
+    folder = write_with_link(tmp_path, kind, name, tmp_path / "elsewhere")
+    with pytest.raises(FormatError, match=r"link: found one to outside .*, expected a file inside the model's folder$"):
+        read_model(folder)
+
+
+@pytest.mark.parametrize(("kind", "name"), [LINKED[k] for k in (2, 3, 4)])
+def test_a_link_within_a_model_is_followed(tmp_path, kind, name):
+    folder = write_with_link(tmp_path, kind, name, tmp_path / "model" / "elsewhere")
+    write_model(read_model(folder), tmp_path / "out", Similarity(2.0, np.eye(3), np.zeros(3)))
+    assert not name.startswith("masks") or (tmp_path / "out" / name).read_bytes() == b"not to be copied"
+
+
+def test_a_mask_of_3_gib_is_not_copied(tmp_path):
+    _, folder = write(tmp_path, "nerfstudio")
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text.replace('{"file_path"', '{"mask_path": "mask.png", "file_path"', 1))
+    STRANGE_FILES["3 GiB"](folder / "mask.png")
+    with pytest.raises(FormatError, match=r"mask\.png: file size: found 3221225472 bytes, expected at most"):
         read_model(folder)
 
 

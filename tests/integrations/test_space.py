@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import io
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -50,6 +52,62 @@ def test_bad_uploads_are_one_line(app, tmp_path):
     (tmp_path / "out").mkdir()
     with pytest.raises(ValueError, match=r"^dhtorch: .*scan\.r3d"):
         app.process(str(tmp_path / "scan.r3d"), str(tmp_path / "out"))
+
+
+def archive_with(method, *, flags=0, cut=None, body=bytes(range(256)) * 9):
+    """Bytes of an archive of one file, with other flags or its content damaged at ``cut``."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        archive.writestr("room/rgb.txt", body)
+    raw = bytearray(out.getvalue())
+    directory = raw.index(b"PK\x01\x02")
+    for at in (6, directory + 8):
+        raw[at] |= flags
+    if cut is not None:
+        raw[cut : cut + 40] = b"\xff" * 40
+    return raw
+
+
+DEFLATED = archive_with(zipfile.ZIP_DEFLATED)
+UNKNOWN = DEFLATED.replace(b"\x08\x00", b"\x62\x00")  # compression method 98
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"nothing", "File is not a zip file"),
+        (b"", "File is not a zip file"),
+        (DEFLATED[:-30], "File is not a zip file"),
+        (archive_with(zipfile.ZIP_DEFLATED, flags=1), "encrypted"),
+        (UNKNOWN, "compression"),
+        *((archive_with(method, cut=60), "") for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2)),
+        (archive_with(zipfile.ZIP_STORED, cut=60), "Bad CRC-32"),
+    ],
+    ids=["no zip", "empty", "cut", "encrypted", "unknown method", "deflate", "lzma", "bzip2", "crc"],
+)
+def test_a_damaged_or_encrypted_archive_is_one_sentence(app, tmp_path, content, found):
+    (tmp_path / "scan.zip").write_bytes(content)
+    with pytest.raises(
+        ValueError, match=f"^scan.zip: found .*{found}.*, expected a whole zip archive without a password"
+    ):
+        app.unpack(tmp_path / "scan.zip", tmp_path / "in")
+
+
+def test_the_files_of_an_answer_are_removed_when_the_page_has_them_and_after_an_error(app, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(ValueError, match="scan"):
+        next(app.answer("scan.zip"))
+    assert not list(tmp_path.iterdir())
+
+    def process(upload, place):
+        (page := Path(place) / "view.html").write_text(upload)
+        return str(page), str(page), ""
+
+    monkeypatch.setattr(app, "process", process)
+    answers = app.answer("scan.r3d")
+    page, *_ = next(answers)
+    assert Path(page).read_text() == "scan.r3d" and next(answers, None) is None
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_page_is_built(app):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import mmap
 import os
 import random
+import re
 import time
 import zipfile
 from collections.abc import Callable
@@ -50,6 +52,73 @@ def test_damaged_captures_are_a_format_error_or_valid(name: str, tmp_path: Path)
     assert counts["frames"] > 0 and counts["FormatError"] > counts.total() // 5  # damage is felt, and not everywhere
 
 
+#: All but settings, which are the user's own.
+FOREIGN = [
+    pytest.param(name, marks=[pytest.mark.slow] * (name not in ("result", "points")))
+    for name in SAMPLES
+    if name != "settings"
+]
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_what_is_no_file_is_a_format_error_or_valid(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pipes, sockets, devices, folders and files of 3 GiB in the place of each kind of file: no hang, no flood."""
+    monkeypatch.setattr(hostile, "PATIENCE", 10)
+    with hostile.sample(*SAMPLES[name], tmp_path) as (good, outcome_of):
+        outcomes = [(what, outcome_of(want)) for what, want in mutations.iter_strange(good)]
+    assert outcomes and not [each for each in outcomes if each[1].kind not in hostile.FINE]
+
+
+#: Words of each command that takes a path; one has a capture beside it.
+COMMANDS = {
+    **{name: [name, "PATH", "out=OUT"] for name in ("complete", "extract")},
+    **{name: [name, "PATH", "output=OUT"] for name in ("integrate", "run", "stream", "validate")},
+    "PATH": ["PATH", "out=OUT"],
+    "inspect": ["inspect", "PATH", "--out", "OUT"],
+    "view": ["view", "PATH", "html=OUT.html"],
+    "report": ["report", "PATH"],
+    "enrich": ["enrich", "PATH", "OUT"],
+    "align": ["align", "PATH", "depth=CAPTURE", "out=OUT"],
+    "align depth": ["align", "CAPTURE", "depth=PATH", "out=OUT"],
+    "validate depth": ["validate", "CAPTURE", "depth=PATH", "output=OUT"],
+    "scale": ["scale", "PATH", "CAPTURE", "out=OUT"],
+    "scale capture": ["scale", "CAPTURE", "PATH", "out=OUT"],
+    "pin": ["pin", "PATH", "CAPTURE", "output=OUT"],
+    "pin source": ["pin", "CAPTURE", "PATH", "output=OUT"],
+}
+#: Hung, read all of it or ended with a traceback once, or with a sentence that did not name what was found.
+ONCE = [
+    *(("view", ".ply", kind) for kind in ("pipe", "device", "3 GiB")),
+    *((name, ".json", "3 GiB") for name in ("view", "report")),
+    ("complete", ".r3d", "pipe"),
+]
+CASES = [
+    *ONCE,
+    *(
+        pytest.param(name, suffix, kind, marks=pytest.mark.slow)
+        for name, suffix, kind in itertools.product(
+            COMMANDS, (".r3d", ".json", ".ply", ".png"), mutations.STRANGE_FILES
+        )
+        if (name, suffix, kind) not in ONCE
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "suffix", "kind"), CASES)
+def test_a_command_says_what_is_no_file(
+    name: str, suffix: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hostile, "PATIENCE", 30)
+    monkeypatch.setattr(hostile, "SECONDS", 20)
+    write_tum(capture := tmp_path / "capture")
+    mutations.STRANGE_FILES[kind](path := tmp_path / f"x{suffix}")
+    places = {"PATH": str(path), "CAPTURE": str(capture), "OUT": str(tmp_path / "out")}
+    words = [re.sub("|".join(places), lambda found: places[found[0]], word) for word in COMMANDS[name]]
+    outcome = hostile.run_command(words, path, tmp_path)
+    found = {"device": "a device", "3 GiB": ""}.get(kind, f"a {kind}")
+    assert outcome.kind == "FormatError" and ((name, suffix, kind) not in ONCE or found in outcome.detail), outcome
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", SAMPLES)
@@ -90,6 +159,12 @@ def _one_file(root: Path) -> Path:
     return root / "a.txt"
 
 
+def _read_zeros(path: Path) -> None:
+    with Path("/dev/zero").open("rb") as zeros:
+        for _ in range(99):
+            zeros.read(1 << 20)
+
+
 def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
     """A reader that does well on the intact file and misbehaves on any other."""
     if not path.is_file() or path.read_bytes() != b"0123456789":
@@ -107,6 +182,7 @@ def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
         (lambda path: sum(0 for _ in iter(int, 1)), "busy"),
         # pages of its own, whatever freed memory the process still holds
         (lambda path: mmap.mmap(-1, 100 << 20).write(bytes(100 << 20)), "memory"),
+        (_read_zeros, "flood"),
         (lambda path: (path.parent / "b").write_text("1"), "crash"),
         (lambda path: (path.parent.parent / "intact" / "a.txt").read_text(), "escape"),
         (lambda path: os.system("true"), "escape"),

@@ -12,7 +12,10 @@ import warnings
 from pathlib import Path
 
 import pytest
+from support.byte_damage import STRANGE_FILES
+from support.damage_harness import bytes_read
 
+from dhtorch.data import FormatError
 from dhtorch.runtime import output_folder, storage
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, open_output_file, open_output_folder
 
@@ -150,6 +153,35 @@ def test_a_link_in_the_place_of_dhtorchs_own_records_is_refused(tmp_path, name):
     with pytest.raises(FileExistsError, match="a link"), open_output_folder(out, "out"):
         pass
     assert contents(elsewhere) == {"1.txt": b"mine"}
+
+
+@pytest.mark.timeout(10)  # opening a pipe waits for the other end
+@pytest.mark.parametrize("name", ["lock", "manifest", "unfinished"])
+@pytest.mark.parametrize("kind", STRANGE_FILES)
+def test_what_is_no_file_in_the_place_of_dhtorchs_own_records_is_refused(tmp_path, name, kind):
+    own = tmp_path / PRIVATE_FOLDER / name
+    own.parent.mkdir()
+    STRANGE_FILES[kind](own)
+    start = bytes_read()
+    if (name, kind) in (("unfinished", "folder"), ("lock", "3 GiB")):  # these are as they should be, or not read
+        with open_output_folder(tmp_path, "out"):
+            pass
+        assert not own.exists()
+        return
+    expected = "file size: found 3221225472 bytes" if (name, kind) == ("manifest", "3 GiB") else f"out: found {own}, a "
+    with pytest.raises((FileExistsError, FormatError), match=expected), open_output_folder(tmp_path, "out"):
+        pass
+    assert bytes_read() - start < 1 << 20
+
+
+def test_a_file_longer_than_any_that_dhtorch_wrote_is_not_read(tmp_path):
+    write(tmp_path, a=CONTENT)
+    (tmp_path / "a").unlink()
+    STRANGE_FILES["3 GiB"](tmp_path / "a")
+    start = bytes_read()
+    with open_output_folder(tmp_path, "out") as folder:
+        assert not folder.owns(tmp_path / "a") and not folder.remove(tmp_path / "a")
+    assert bytes_read() - start < 1 << 20
 
 
 def test_a_folder_without_results_leaves_nothing(tmp_path):

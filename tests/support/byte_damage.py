@@ -11,17 +11,42 @@ import json
 import os
 import pickle
 import random
+import stat
 import struct
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 EXECUTED = 86  # exit code of a process that ran code out of a file
 
-Capture = dict[str, bytes | None]  # None = a folder stands where the file was
+#: Content of a file by name; None = a folder stands where the file was, a function makes what does.
+Capture = dict[str, bytes | Callable[[Path], None] | None]
+
+
+def _sparse(path: Path) -> None:
+    """A file of 3 GiB that takes no place on the disk."""
+    path.touch()
+    os.truncate(path, 3 << 30)
+
+
+#: What is no file of a capture, by name → a function that makes it.
+STRANGE_FILES: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo,
+    "socket": lambda path: os.mknod(path, stat.S_IFSOCK | 0o600),
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+    "3 GiB": _sparse,
+}
+
+
+def iter_strange(good: Capture) -> Iterator[tuple[str, Capture]]:
+    """(description, capture) with each of ``STRANGE_FILES`` in the place of one file of each kind."""
+    for name in {_kind(name): name for name in sorted(good)}.values():
+        yield from ((f"{name}: {what}", good | {name: make}) for what, make in STRANGE_FILES.items())
 
 
 def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
@@ -44,8 +69,12 @@ def _victim(capture: Capture, draw: random.Random) -> str:
     kinds: dict[str, list[str]] = {}
     for name, content in sorted(capture.items()):
         if content is not None:
-            kinds.setdefault("".join(c for c in name if not c.isdigit()), []).append(name)
+            kinds.setdefault(_kind(name), []).append(name)
     return draw.choice(kinds[draw.choice(sorted(kinds))])
+
+
+def _kind(name: str) -> str:
+    return "".join(c for c in name if not c.isdigit())
 
 
 def _move(capture: Capture, draw: random.Random) -> str:

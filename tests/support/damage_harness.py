@@ -3,14 +3,17 @@
 ``attack(write, read, tmp_path)`` lets ``write`` make one intact sample, then makes seeded mutants of it. Each one is
 read in a forked child of this (warmed-up) process, under a limit of time and of memory, with no right to write. The
 outcome of a mutant is ``"frames"`` (it read as valid data), ``"FormatError"`` (one line that names file and field) or a
-failure: another exception, a crash, a hang, too much work or memory, a file touched outside the capture, code executed.
+failure: another exception, a crash, a hang, too much work or memory, too many bytes read, a file touched outside the
+capture, code executed.
 
 The damage is that of ``byte_damage``; the number of a mutant determines it: ``attack(..., only=17)`` repeats mutant 17.
 """
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
+import io
 import os
 import random
 import resource
@@ -29,6 +32,7 @@ from typing import Any, NamedTuple
 import torch
 
 from dhtorch import data
+from dhtorch.cli import run as commands
 from dhtorch.data import FormatError
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
@@ -39,6 +43,7 @@ from support.byte_damage import EXECUTED, Capture, mutate
 SECONDS = 2  # of a processor for one mutant, whatever else the machine does
 PATIENCE = 60.0  # wall clock after which it hangs
 BYTES = 512 << 20  # resident, above the level before the call
+READ_BYTES = 64 << 20  # read from files, many times the size of a sample
 FINE = ("frames", "FormatError")
 
 
@@ -170,14 +175,28 @@ def sample(
 # ------------------------------------------------------------------------------------------------- one mutant, one child
 
 
-def run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> Outcome:
+def run_command(words: Sequence[str], path: Path, tmp_path: Path) -> Outcome:
+    """Run ``dhtorch`` in a forked child, which may write; FormatError where it ends with one sentence and exit code 2."""
+
+    def read(path: Path) -> None:
+        with contextlib.redirect_stderr(io.StringIO()) as stream:
+            code = commands.main([*words])
+        lines = [line for line in stream.getvalue().splitlines() if line.startswith("dhtorch: ") or code not in (0, 2)]
+        if code == 2 and len(lines) == 1:
+            raise FormatError(path, "command", lines[0], "another path")
+        assert code == 0, f"exit code {code}: {lines}"
+
+    return run(read, path, tmp_path, may_write=True)
+
+
+def run(read: Callable[[Path], Any], path: Path, tmp_path: Path, *, may_write: bool = False) -> Outcome:
     """Read ``path`` in a forked child, which may use a processor for ``SECONDS``."""
     end, child_end = os.pipe()
     start = time.perf_counter()
     pid = os.fork()
     if pid == 0:
         os.close(end)
-        _child(read, path, tmp_path, child_end)
+        _child(read, path, tmp_path, child_end, may_write)
     os.close(child_end)
     output, level, killed = b"", 0, ""
     while True:
@@ -210,7 +229,7 @@ def run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> Outcome:
     return Outcome(kind, detail, seconds, peak)
 
 
-def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int) -> None:
+def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int, may_write: bool) -> None:
     """Never returns: writes the level of memory, the outcome and its detail, and exits."""
     kind, detail = "crash", ""
     try:
@@ -219,13 +238,14 @@ def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int)
             os.dup2(nothing, stream)
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115  (pytest's own would write to a file)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python turns it into an error that a reader might swallow
-        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+        if not may_write:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
         resource.setrlimit(
             resource.RLIMIT_AS, (_virtual() + 8 * BYTES, -1)
         )  # the machine survives what the watch misses
-        touched = _guard(tmp_path.resolve(), path)
+        touched, start = [] if may_write else _guard(tmp_path.resolve(), path), bytes_read()
         os.write(report, f"{_resident(os.getpid())}\n".encode())
         faulthandler.enable(report, all_threads=False)  # the last words of a crash
         try:
@@ -237,6 +257,8 @@ def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int)
                 kind = "a FormatError that does not name file and field"
         if touched:
             kind, detail = "escape", "; ".join(touched[:3])
+        elif (size := bytes_read() - start) > READ_BYTES:
+            kind, detail = "flood", f"{size} bytes read: {detail}"
     except BaseException as error:
         kind, detail = type(error).__name__, "".join(traceback.format_exception(error)[-5:])
     os.write(report, f"{kind}\n{detail}"[:4000].encode())
@@ -271,6 +293,11 @@ def _resident(pid: int) -> int:
         return 0
 
 
+def bytes_read() -> int:
+    """Bytes that this process has read so far."""
+    return int(Path("/proc/self/io").read_text().split()[1])
+
+
 def _virtual() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
@@ -280,7 +307,7 @@ def _lay(root: Path, have: Capture, want: Capture) -> None:
     changed = [name for name in have.keys() | want.keys() if have.get(name, 0) is not want.get(name, 0)]
     for name in changed:
         file = root / name
-        if file.is_dir():
+        if file.is_dir() and not file.is_symlink():
             file.rmdir()
         else:
             file.unlink(missing_ok=True)
@@ -288,4 +315,5 @@ def _lay(root: Path, have: Capture, want: Capture) -> None:
         file, content = root / name, want.get(name, b"")
         if name in want:
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.mkdir() if content is None else file.write_bytes(content)
+            make = Path.mkdir if content is None else content
+            make(file) if callable(make) else file.write_bytes(make)

@@ -24,7 +24,7 @@ import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from dhtorch import calibration
+from dhtorch import calibration, export
 from dhtorch import testing as writers
 from dhtorch.cli import errors, pin
 from dhtorch.cli import run as commands
@@ -43,6 +43,7 @@ from dhtorch.extract.shards import find_finished_shards
 from dhtorch.measure.pin import CameraPin
 from dhtorch.runtime import results as result_files
 from dhtorch.stages.score import LearnedScore
+from dhtorch.viz.viewer.points import read_ply_exhibit
 from support import room_models
 from support.captures_by_format import Sample, small_walk, write_lerobot_v2, write_lerobot_v3, write_tum
 from support.damage_harness import read_all
@@ -131,6 +132,13 @@ def read_result(path: Path) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         report.main([str(path)])
         report.main([str(path), "--markdown"])
+
+
+def write_points(root: Path) -> Path:
+    """Points as ``dhtorch complete`` writes them."""
+    xyz = np.random.default_rng(0).normal(size=(40, 3))
+    export.write_ply(root / "points.ply", xyz, sigma=np.ones(40), source=np.arange(40) % 3, comments=("up 0 1 0",))
+    return root / "points.ply"
 
 
 def write_calibration(root: Path) -> Path:
@@ -319,6 +327,7 @@ OTHER_INPUTS: dict[str, Sample] = {
         kind: (partial(write_result, name=name), as_format_error(read_result, ValueError, OSError))
         for kind, name in {"result": None, "result_census": "hole_census", "result_probe": "vo_probe"}.items()
     },
+    "points": (write_points, as_format_error(read_ply_exhibit, ValueError)),
     "calibration": (write_calibration, as_format_error(read_calibration, ValueError, OSError)),
     "learned_score": (write_learned_score, as_format_error(LearnedScore.read, ValueError, OSError)),
     "settings": (write_settings, read_settings),

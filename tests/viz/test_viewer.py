@@ -1,10 +1,12 @@
 """Seeing: what is shown is what was computed, in a page that a browser draws and in a recording that Rerun reads."""
 
 import base64
+import contextlib
 import copy
 import html.parser
 import importlib.util
 import io
+import itertools
 import json
 import math
 import re
@@ -19,6 +21,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
+from support import damage_harness
 from support.room_truth import room_distance
 from support.rooms import Changed, room_scene
 from support.rooms import room as rendered
@@ -467,13 +470,18 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
         "dhtorch.export.write_ply",
         "dhtorch.synthetic.recording._rotate_device_axes",
         "dhtorch.synthetic.recording.simulate_phone_lidar.__globals__",
+        "dhtorch.synthetic.robot.open_robot",
+        "dhtorch.synthetic.robot.write_robot",
+        "dhtorch.data.rig.Rig",
+        ["dhtorch.data.open_all"],
         7,
         None,
     ],
 )
 def test_a_result_calls_only_what_settings_are_meant_to_name(job, name):
     result = result_files.read_result(job)
-    for place in (["data"], ["method"], ["method", "track"]):
+    result["config"]["method"]["track"]["deep"] = [{"a": {"_target_": "x", "_partial_": True, "_recursive_": False}}]
+    for place in (["data"], ["method"], ["method", "track"], ["method", "track", "deep", 0, "a"]):
         changed = copy.deepcopy(result)
         node = changed["config"]
         for key in place:
@@ -481,6 +489,43 @@ def test_a_result_calls_only_what_settings_are_meant_to_name(job, name):
         node["_target_"] = name
         with pytest.raises(ValueError, match="_target_"):
             again.rebuild_parts(changed)
+
+
+#: Of the settings that ship, those that write: they are not shown again.
+WRITING = {"dhtorch.synthetic.robot.open_robot"}
+
+
+def test_a_result_that_writes_is_refused(job, command, tmp_path):
+    result = result_files.read_result(job)
+    options = {"tasks": 1, "scenes": 1, "n_frames": 1, "hw": [36, 64]}
+    result["config"]["data"] = {
+        "_target_": "dhtorch.synthetic.robot.open_robot",
+        "root": str(tmp_path / "new"),
+        **options,
+    }
+    result_files.write_result(tmp_path / "old" / "result.json", result)
+    code, _, err = command("view", "old", "html=page.html")
+    assert code == 2 and len(err.splitlines()) == 1 and "config.data._target_: found 'dhtorch.synthetic.robot" in err
+    assert not (tmp_path / "new").exists() and not (tmp_path / "page.html").exists()
+
+
+def test_what_a_result_may_name_writes_nothing(job, tmp_path, monkeypatch):
+    """The data settings that ship, their data at a new path or an empty folder, in a process that may not write."""
+    pytest.importorskip("h5py")  # starts a program when it is imported
+    result = result_files.read_result(job)
+    settings = [OmegaConf.to_container(OmegaConf.load(file)) for file in (run.config_dir() / "data").glob("*.yaml")]
+
+    def open_each(path):
+        for data, root in itertools.product(settings, (path, path / "new")):
+            result["config"]["data"] = data | {"root": str(root)}
+            with contextlib.suppress(ValueError, OSError):
+                again.rebuild_parts(result)
+
+    settings = [data for data in settings if "root" in data]
+    assert WRITING & {data["_target_"] for data in settings}
+    monkeypatch.setattr(damage_harness, "SECONDS", 20)
+    (tmp_path / "capture").mkdir()
+    assert damage_harness.run(open_each, tmp_path / "capture", tmp_path).kind == "frames"
 
 
 def test_options_that_a_function_has_not_are_named(job):
@@ -497,7 +542,7 @@ def test_every_setting_that_ships_can_be_shown_again(job, group, folder):
         name for file in files for name in code_dependencies.iter_targets(OmegaConf.to_container(OmegaConf.load(file)))
     }
     assert named
-    for name in named:
+    for name in named - WRITING:
         result = result_files.read_result(job)
         result["config"][group] = {"_target_": name, "_partial_": True}
         module, _, last = name.rpartition(".")

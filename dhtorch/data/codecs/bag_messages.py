@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, import_optional
-from dhtorch.runtime.safe_open import check_memory, modification_time_ns
+from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_memory, modification_time_ns
 
 #: Bytes of a message that indexing reads: header, size and encoding of a picture.
 HEAD_BYTES: Final = 1024

@@ -14,8 +14,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_FILE_BYTES, MAX_TEXT_BYTES, FormatError, import_optional
-from dhtorch.runtime.safe_open import check_memory, check_regular_file, open_regular, unreadable_error
+from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.runtime.safe_open import (
+    MAX_FILE_BYTES,
+    MAX_TEXT_BYTES,
+    check_memory,
+    check_regular_file,
+    open_regular,
+    unreadable_error,
+)
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # built into the library

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, open_regular
 
 #: First bytes of a Matroska file: the identifier of its EBML header.
 MATROSKA_SIGNATURE: Final = b"\x1a\x45\xdf\xa3"

@@ -21,8 +21,8 @@ from dhtorch.data.codecs.bag_messages import (
     decompress_chunk,
     make_topic,
 )
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 #: First and last bytes of a file.
 MCAP_SIGNATURE: Final = b"\x89MCAP0\r\n"

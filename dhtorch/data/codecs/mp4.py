@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
-from dhtorch.runtime.safe_open import check_memory
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, check_memory
 
 #: Types of the first box of a file.
 MP4_FIRST_BOXES: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")

@@ -20,8 +20,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs.zips import check_zip_directory
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
-from dhtorch.runtime.safe_open import check_memory, open_regular
+from dhtorch.data.io.decode import FormatError, read_bytes
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_memory, open_regular
 
 #: Largest size of a header in bytes.
 _MAX_HEADER_BYTES = 12_288

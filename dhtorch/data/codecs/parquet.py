@@ -14,10 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs import thrift
-from dhtorch.data.io.decode import MAX_FILE_BYTES, MAX_TEXT_BYTES, FormatError, import_optional
+from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.runtime.safe_open import (
+    MAX_FILE_BYTES,
     MAX_MEMORY_BYTES,
     MAX_MEMORY_RATIO,
+    MAX_TEXT_BYTES,
     modification_time_ns,
     open_regular,
     unreadable_error,

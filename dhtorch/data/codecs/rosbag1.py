@@ -20,8 +20,8 @@ from dhtorch.data.codecs.bag_messages import (
     decompress_chunk,
     make_topic,
 )
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 #: First bytes of a bag.
 BAG_SIGNATURE: Final = b"#ROSBAG V2.0\n"

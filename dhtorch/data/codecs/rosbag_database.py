@@ -15,8 +15,8 @@ from typing import Final
 from urllib.parse import quote
 
 from dhtorch.data.codecs.bag_messages import HEAD_BYTES, IndexedMessage, MessagePlace, Topic, make_topic
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 #: First bytes of a database.
 SQLITE_SIGNATURE: Final = b"SQLite format 3\0"

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular, unreadable_error
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular, unreadable_error
 
 _BLOCK_BYTES = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header

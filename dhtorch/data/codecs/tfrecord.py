@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
-from dhtorch.runtime.safe_open import open_regular, unreadable_error
+from dhtorch.data.io.decode import FormatError
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular, unreadable_error
 
 _MAX_RECORDS = 10_000_000
 _MAX_FIELDS = 2_000_000  # of one record: names, images, runs of numbers

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import re
 import struct
 import zlib
@@ -23,14 +22,10 @@ import cv2
 import numpy as np
 
 from dhtorch.geometry.no_depth import NO_DEPTH_CODES
-from dhtorch.runtime.safe_open import FormatError, check_memory, open_regular, unreadable_error
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, FormatError, check_memory, read_bytes
 
 #: Largest number of pixels of an image, above that of all supported cameras; larger headers are damaged or hostile.
 MAX_PIXELS = 64_000_000
-#: Largest size in bytes of an array or a file.
-MAX_FILE_BYTES = 256_000_000
-#: Largest size in bytes of a table or a JSON document.
-MAX_TEXT_BYTES = 64_000_000
 #: Suffixes of images, tried where a format may leave out theirs.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 #: Numbers shown in an error message.
@@ -431,22 +426,6 @@ def read_text(file: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(file, "text", error.reason, "UTF-8") from None
-
-
-def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """All bytes of a file, at least one and at most ``limit``.
-
-    Raises:
-        FormatError: the file is missing, unreadable, no regular file, outside the capture, empty or too large.
-    """
-    with open_regular(file) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        if not 0 < size <= limit:
-            raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
-        try:
-            return stream.read(size)  # of ``limit`` bytes a buffer would be allocated
-        except OSError as error:
-            raise unreadable_error(file, error) from None
 
 
 def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:

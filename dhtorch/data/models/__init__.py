@@ -11,9 +11,10 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.models.colmap import find_colmap_model, read_colmap_model
 from dhtorch.data.models.nerfstudio import read_nerfstudio_model
 from dhtorch.data.models.network import read_network_model
-from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, write_model
+from dhtorch.data.models.scene_model import INSIDE_MODEL, ModelView, SceneModel, Similarity, write_model
 from dhtorch.data.models.splat import read_splat_model
 from dhtorch.data.readers.nerfstudio import find_transforms
+from dhtorch.runtime.safe_open import restrict_links
 
 __all__ = ["ModelView", "SceneModel", "Similarity", "read_model", "write_model"]
 
@@ -26,9 +27,12 @@ def read_model(root: str | Path, *, images: str | Path | None = None) -> SceneMo
         images: folder of its pictures. None = ``images/`` beside or above the model.
 
     Raises:
-        FormatError: another format, a damaged file, a model without points and depth.
+        FormatError: another format, a damaged file, a model without points and depth, a link to outside the model's
+            folder.
     """
-    return _checked(_read_format(Path(root), None if images is None else Path(images)))
+    root = Path(root)
+    with restrict_links(root if root.is_dir() else root.parent, INSIDE_MODEL):
+        return _checked(_read_format(root, None if images is None else Path(images)))
 
 
 def _read_format(root: Path, pictures: Path | None) -> SceneModel:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, read_points, write_points
 from dhtorch.data.readers.nerfstudio import parse_lens, parse_matrix, resolve_image
 from dhtorch.runtime import storage
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_regular_file
 
 #: Names of a frame's files, which are copied beside the written ``transforms.json``.
 _FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
@@ -37,6 +40,9 @@ def read_nerfstudio_model(file: Path) -> SceneModel:
         K, hw, lens = parse_lens({**meta, **entry}, image, file, k)
         c2w = parse_matrix(entry.get("transform_matrix"), file, f"frames.{k}.transform_matrix")
         picture = image if image.is_file() else None
+        for each in filter(Path.is_file, [image, *_files_of_frame(folder, entry, file)]):
+            if (size := check_regular_file(each)) > MAX_FILE_BYTES:
+                raise FormatError(each, "file size", f"{size} bytes", f"at most {MAX_FILE_BYTES}")
         views.append(ModelView(entry["file_path"], K, hw, convert.cv_from_gl(c2w), lens, picture))
 
     def save(out: Path, similarity: Similarity) -> None:
@@ -44,12 +50,15 @@ def read_nerfstudio_model(file: Path) -> SceneModel:
         for view, entry in zip(views, entries, strict=True):
             moved = convert.cv_from_gl(similarity.move(view.c2w))  # the change of axes is its own inverse
             frames.append({**entry, "transform_matrix": moved.tolist()})
-            for key in _FILE_KEYS:
-                if isinstance(entry.get(key), str):
-                    stored = files.resolve_inside(folder, entry[key], file, key)
-                    storage.copy_file(stored, files.resolve_inside(out, entry[key], file, key))
+            for stored in _files_of_frame(folder, entry, file):
+                storage.copy_file(stored, out / stored.relative_to(folder))
         kept = {key: value for key, value in meta.items() if key not in ("applied_transform", "applied_scale")}
         storage.write_json(out / file.name, {**kept, "ply_file_path": cloud.name, "frames": frames})
         write_points(out / cloud.name, vertices, similarity)
 
     return SceneModel(views, vertices.xyz[np.isfinite(vertices.xyz).all(1)], "nerfstudio", file, save)
+
+
+def _files_of_frame(folder: Path, entry: Mapping[str, Any], file: Path) -> list[Path]:
+    """Paths of a frame's files, as ``transforms.json`` names them."""
+    return [files.resolve_inside(folder, entry[k], file, k) for k in _FILE_KEYS if isinstance(entry.get(k), str)]

@@ -11,7 +11,7 @@ import numpy as np
 from dhtorch.data.codecs.npy import list_npz, read_npz
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, find_picture
+from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, check_inside, find_picture
 from dhtorch.runtime import storage
 
 #: Names of arrays in files of networks: VGGT, Depth Anything 3, MapAnything, DUSt3R and MASt3R.
@@ -68,11 +68,10 @@ def _names_of_arrays(
         return [str(name) for name in np.atleast_1d(names).ravel()]
     if n_archives > 1:
         return [archive.stem]
-    folder = pictures if pictures is not None else (root if root.is_dir() else root.parent) / "images"
-    present_files = (
-        [file for file in folder.glob("*") if file.suffix in files.IMAGE_SUFFIXES] if folder.is_dir() else []
-    )
-    return sorted(present_files, key=files.natural_sort_key) or None
+    top = pictures if pictures is not None else root if root.is_dir() else root.parent
+    below = top if pictures is not None else top / "images"
+    present_files = [file for file in below.glob("*") if file.suffix in files.IMAGE_SUFFIXES] if below.is_dir() else []
+    return [check_inside(file, top) for file in sorted(present_files, key=files.natural_sort_key)] or None
 
 
 def _views_of_arrays(

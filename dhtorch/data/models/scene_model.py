@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,11 +18,15 @@ from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera
 from dhtorch.runtime import storage
 from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
-from dhtorch.runtime.safe_open import check_regular_file
+from dhtorch.runtime.safe_open import check_link, check_regular_file, restrict_links
 
 #: A model point is seen in a picture unless another one is nearer by this fraction within a cell of so many cells
 #: across. Source: origin not recorded.
 _OCCLUSION_REL, _OCCLUSION_CELLS = 0.05, 48
+
+
+#: What is expected instead of a link that leads out of a model, for messages.
+INSIDE_MODEL = "a file inside the model's folder"
 
 
 class Similarity(NamedTuple):
@@ -128,14 +133,29 @@ def write_model(model: SceneModel, out: Path, similarity: Similarity) -> None:
 
 
 def find_picture(folder: Path, name: str, pictures: Path | None) -> Path | None:
-    """File of a picture below ``images/`` of the folder or up to two folders above it; None where there is none."""
-    above = [folder, *folder.resolve().parents[:2]]
-    for base in [pictures] if pictures is not None else [f / sub for f in above for sub in ("images", "rgb", "color")]:
+    """File of a picture below ``images/`` of the folder or up to two folders above it; None where there is none.
+
+    Raises:
+        FormatError: a name or a link that leads out of the folder that holds ``images/``, or out of ``pictures``.
+    """
+    above = [folder, *folder.resolve().parents[:2]] if pictures is None else [pictures]
+    for top, below in itertools.product(above, ("images", "rgb", "color") if pictures is None else ("",)):
         for suffix in ("", *files.IMAGE_SUFFIXES):
-            file = files.resolve_inside(base, name + suffix, folder, "picture")
+            file = files.resolve_inside(top / below, name + suffix, folder, "picture")
             if file.is_file():
-                return file
+                return check_inside(file, top)
     return None
+
+
+def check_inside(file: Path, folder: Path) -> Path:
+    """The file, below ``folder``, after a check that no link leads out of that.
+
+    Raises:
+        FormatError: a link does.
+    """
+    with restrict_links(folder, INSIDE_MODEL):
+        check_link(file)
+    return file
 
 
 def read_points(file: Path) -> PlyVertices:

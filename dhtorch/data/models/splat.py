@@ -14,6 +14,7 @@ from dhtorch.data.models.scene_model import (
     ModelView,
     SceneModel,
     Similarity,
+    check_inside,
     find_picture,
     read_points,
     write_points,
@@ -27,10 +28,11 @@ def read_splat_model(file: Path, pictures: Path | None) -> SceneModel:
     Raises:
         FormatError: a damaged file, no cameras.
     """
-    places = [f / "cameras.json" for f in [file.parent, *file.resolve().parents[1:3]] if (f / "cameras.json").is_file()]
+    folder = file.parent
+    places = [f / "cameras.json" for f in (folder, *folder.resolve().parents[:2]) if (f / "cameras.json").is_file()]
     if not places:
-        raise FormatError(file.parent, "cameras.json", "none beside or above the PLY", "the splat's cameras")
-    source = places[0]
+        raise FormatError(folder, "cameras.json", "none beside or above the PLY", "the splat's cameras")
+    source = check_inside(places[0], places[0].parent)
     cameras = files.decode_json(files.read_text(source), source)
     vertices, views = read_points(file), []
     for k, entry in enumerate(files.get_entry({"cameras": cameras}, "cameras", list, source)):

@@ -40,7 +40,7 @@ def recognise(file: Path) -> str | None:
     if _METADATA_START in _read_tail(file):
         return "an mp4 with an intrinsicMatrix at its end"
     side_car = file.parent / "metadata.json"
-    if side_car.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side_car, files.MAX_TEXT_BYTES):
+    if side_car.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side_car, doors.MAX_TEXT_BYTES):
         return "an mp4 beside a metadata.json with an intrinsicMatrix"
     return None
 

@@ -23,7 +23,7 @@ from dhtorch.data.codecs.bag_messages import (
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rosbag_transforms import TransformTree
-from dhtorch.runtime.safe_open import open_regular
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 _IMAGE_TYPES: Final = {"sensor_msgs/Image": False, "sensor_msgs/CompressedImage": True}  # type → whether compressed
 _CODINGS: Final = ("cdr", "ros1")
@@ -115,8 +115,8 @@ def read_message(place: MessagePlace) -> bytes:
     """All bytes of a message."""
     if place.chunk == rosbag_database.DATABASE_ROW:
         return rosbag_database.read_database_message(place)
-    if not 0 <= place.length <= files.MAX_FILE_BYTES:
-        raise FormatError(place.file, "message", f"{place.length} bytes", f"at most {files.MAX_FILE_BYTES}")
+    if not 0 <= place.length <= MAX_FILE_BYTES:
+        raise FormatError(place.file, "message", f"{place.length} bytes", f"at most {MAX_FILE_BYTES}")
     if place.chunk >= 0:
         is_mcap = read_signature(place.file).startswith(mcap.MCAP_SIGNATURE)
         content = (mcap.read_mcap_chunk if is_mcap else rosbag1.read_bag_chunk)(place.file, place.chunk)

@@ -13,7 +13,7 @@ from dhtorch.data import scenes_root
 from dhtorch.data.io.decode import FormatError
 from dhtorch.experiments.focal import ddff12, fod500, image_folder
 from dhtorch.experiments.focal.stacks import FocalStacks
-from dhtorch.runtime.safe_open import restrict_links
+from dhtorch.runtime.safe_open import check_file_or_folder, restrict_links
 
 #: Name → reader, tried in this order; the first that recognises a folder reads it.
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
@@ -34,8 +34,7 @@ def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = 
         ValueError: an option unknown to the reader.
     """
     root = Path(root)
-    if not root.exists():
-        raise FormatError(root, "path", "no such file or folder", "focal stacks")
+    check_file_or_folder(root, "focal stacks")
     if format == "auto":
         format = recognise_stacks(root, follow_links=follow_links)[0]
     elif format not in STACK_FORMATS:

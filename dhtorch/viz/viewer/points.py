@@ -23,9 +23,8 @@ def read_ply_exhibit(path: Path) -> Exhibit:
 
     Raises:
         ValueError: no PLY (text or binary little-endian) with x, y and z, or a truncated file.
-        OSError: no such file.
     """
-    vertex = read_ply_vertices(path).vertex
+    vertex, header, *_ = read_ply_vertices(path)
     vertex = vertex[np.isfinite([vertex[a] for a in "xyz"]).all(0)]
     if len(vertex) > _MAX_POINTS:
         vertex = _subsample(vertex)
@@ -38,7 +37,7 @@ def read_ply_exhibit(path: Path) -> Exhibit:
         else np.where(source == Source.SENSOR, Hole.NONE, Hole.TRACKABLE_NO_LIDAR)
     )
     xyz = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float32)
-    up = _read_up(path)
+    up = _read_up(header)
     xyz = xyz if up is None else (xyz @ turn_between(up).T.numpy()).astype(np.float32)
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in properties else grey for c in ("red", "green", "blue")], -1)
@@ -73,10 +72,9 @@ def _subsample(vertex: np.ndarray) -> np.ndarray:
     return vertex[np.sort(np.concatenate(subset))]
 
 
-def _read_up(path: Path) -> list[float] | None:
+def _read_up(header: bytes) -> list[float] | None:
     """Upward direction from the header comment ``up``, None without one."""
-    head = path.read_bytes().partition(b"end_header\n")[0].decode("ascii", "replace")
-    match = re.search(r"^comment up (\S+) (\S+) (\S+)$", head, re.MULTILINE)
+    match = re.search(r"^comment up (\S+) (\S+) (\S+)$", header.decode("ascii", "replace"), re.MULTILINE)
     try:
         up = [float(v) for v in match.groups()] if match else []
     except ValueError:
