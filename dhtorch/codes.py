@@ -244,6 +244,33 @@ class WrongCause(CodeTable):
     )
 
 
+#: Kind of a pixel, as counts and pages name it → its codes of :class:`Source`. Only values from other views are
+#: ``recovered``; values interpolated from neighbours are ``filled``.
+SOURCES_OF_KIND: Final[dict[str, tuple[int, ...]]] = {
+    "recovered": (Source.RECOVERED, Source.SWEPT),
+    "filled": (Source.FILLED,),
+    "sensor": (Source.SENSOR,),
+    "no_answer": (Source.NONE,),
+}
+
+
+def count_kinds(by_source: Any) -> dict[str, Any]:
+    """Numbers by kind of :data:`SOURCES_OF_KIND` from numbers by source.
+
+    ``by_source``: what is counted, indexed by code of :class:`Source`: numbers of pixels, as of ``bincount``, their
+    fractions, or arrays of them.
+    """
+    return {kind: sum(by_source[code] for code in codes) for kind, codes in SOURCES_OF_KIND.items()}
+
+
+def is_recovered(source: Any) -> Any:
+    """Whether a depth comes from other views: swept, or a sparse answer at that pixel.
+
+    ``source``: a tensor or an array of codes of :class:`Source`; the result is of the same kind, bool.
+    """
+    return (source == Source.RECOVERED) | (source == Source.SWEPT)
+
+
 def is_swept(source: Any) -> Any:
     """Whether a pixel of a dense map has a depth without a return: matched, or interpolated from such neighbours.
 

@@ -27,6 +27,13 @@ def test_estimated_pixels_are_swept_filled_or_recovered():
     assert codes.is_swept(source).tolist() == [False, False, False, True, True]
     assert codes.is_estimated(source).tolist() == [False, False, True, True, True]
     assert codes.is_estimated(source.numpy()).tolist() == [False, False, True, True, True]
+    assert codes.is_recovered(source).tolist() == [False, False, True, True, False]
+
+
+def test_recovered_pixels_are_those_of_other_views_alone():
+    counts = {Source.NONE: 1, Source.SENSOR: 10, Source.RECOVERED: 100, Source.SWEPT: 1000, Source.FILLED: 10000}
+    kinds = codes.count_kinds(counts)
+    assert list(kinds.items()) == [("recovered", 1100), ("filled", 10000), ("sensor", 10), ("no_answer", 1)]
 
 
 def test_the_first_reason_counts():

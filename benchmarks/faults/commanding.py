@@ -55,7 +55,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("resize_picture", "* 255", "* 256"),
         ("resize_picture", 'mode="area"', 'mode="nearest"'),
     ],
-    "cli.completed_folder": [("count_estimated", "for name in ESTIMATED", "for name in list(ESTIMATED)[:1]")],
+    "cli.completed_folder": [("count_pixels", ".get(name.lower(), 0)", ".get(name, 0)")],
     "cli.enrich": [
         ("_KEY_OPTIONS", '"pose_sigma",', ""),
         ("_KEY_OPTIONS", ', "on_error", "sensor"', ', "on_error"'),
@@ -74,7 +74,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "cli.enrich_page": [
         ("_pixel_shares", "if share >= _MIN_REASON_SHARE", "if share >= 0.1"),
         ("_pixel_shares", "key=lambda x: -x[1]", "key=lambda x: x[1]"),
-        ("_CODES_OF_KIND", "(Source.RECOVERED, Source.SWEPT, Source.FILLED)", "(Source.RECOVERED, Source.SWEPT)"),
         ("summarise_cameras", 'own["cameras"][name] for own in owns if', 'own["cameras"][name] for own in owns[:1] if'),
         ("_average_over_episodes", "np.linspace(0, 1, len(x)), x[:, c]", "np.linspace(0, 1, len(x)), x[:, 0]"),
         ("_average_over_episodes", "np.mean(resampled, 0)", "np.sum(resampled, 0)"),
@@ -116,8 +115,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "cli.recover_page": [
         ("measure_recovery", "(2, 98)", "(20, 80)"),
-        ("measure_recovery", "n_of(row, kind) / n for row", "n_of(row, kind) / totals[0] for row"),
-        ("measure_recovery", "/ len(rows)", ""),
+        ("measure_recovery", "sum(n.values()) for n in counts", "sum(counts[0].values()) for n in counts"),
+        ("measure_recovery", "/ len(counts)", ""),
         ("_average_no_answer_shares", "share / len(rows)", "share"),
     ],
     "cli.recover_pictures": [("_pick_evenly", "(k + 0.5)", "k")],

@@ -44,6 +44,8 @@ TESTS: dict[str, list[str]] = {
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "codes": [
+        ("SOURCES_OF_KIND", "(Source.RECOVERED, Source.SWEPT)", "(Source.RECOVERED, Source.SWEPT, Source.FILLED)"),
+        ("is_recovered", "source == Source.SWEPT", "source >= Source.SWEPT"),
         ("is_swept", "(source == Source.SWEPT) | (source == Source.FILLED)", "source == Source.SWEPT"),
         ("is_estimated", " | (source == Source.RECOVERED)", ""),
         ("_name_code", "if value & bit", "if value | bit"),

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import torch.nn.functional as F
 
 from dhtorch import export
 from dhtorch.cli import completed_folder as completed
+from dhtorch.cli import recover_page
 from dhtorch.cli.completed_folder import EXTRA_FILES, CompletionTask, Row
 from dhtorch.cli.layouts import FRAME_LAYOUTS, has_varying_camera, select_layout, stray_confidence
 from dhtorch.codes import Gate, Source, is_estimated, names, words
@@ -63,8 +63,8 @@ _OPTION_RANGES = {
 #: Pixels per inch of the figures of ``previews/``, about 1000 px wide. Source: chosen for an eighth of a figure's size.
 _PREVIEW_DPI = 100.0
 
-#: Source name in a meta file → name in printed text.
-_SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "no answer"}
+#: Sources whose number of pixels is in every meta file; that of others is left out where it is 0.
+_COUNTED_SOURCES = ("none", "sensor", "swept")
 
 #: Values of ``figures`` and ``points``: no frame, the first one, or all frames.
 _EXTRAS_CHOICES = (False, True, "all")
@@ -282,11 +282,8 @@ def _describe_frame(task: CompletionTask, i: int, reference: Frame, steps: expor
 
 def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     """Pixel counts by source, and fractions of all pixels without an answer, by reason."""
-    kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in _SOURCE_LABELS}
-    pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
-    others = {name: getattr(Source, name.upper()) for name in ("recovered", "aligned", "filled")}
-    counts = {name: int((steps.source == code).sum()) for name, code in others.items()}
-    pixels |= {name: n for name, n in counts.items() if n}
+    counts = {name.lower(): int((steps.source == code).sum()) for code, name in names(Source).items()}
+    pixels = {name: n for name, n in counts.items() if n or name in _COUNTED_SOURCES}
     gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
     no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
@@ -366,21 +363,16 @@ def _write_points(
 def _format_summary(task: CompletionTask, n_untouched: int) -> str:
     """Printed summary of one scene."""
     rows = [task.done[task.name(i)] for i in task.frames]
-    pixels: Counter[str] = Counter()
-    no_answer: Counter[str] = Counter()
-    for row in rows:
-        pixels.update(row["pixels"])
-        no_answer.update({k: share / len(rows) for k, share in row["no_answer"].items()})
-    pixels["swept"] = completed.count_estimated(pixels)
-    for name in completed.ESTIMATED[1:]:
-        pixels.pop(name, None)
-    sensor, swept, none = (f"{kind} {pixels[k] / pixels.total():.1%}" for k, kind in _SOURCE_LABELS.items())
-    unfit = no_answer.pop("unfit")
-    reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in no_answer.most_common())
+    stats = recover_page.measure_recovery(task, task.frames)
+    reasons = dict(stats.reasons)
+    unfit = reasons.pop("unfit")
+    why = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in reasons.items())
+    counts = {kind: f"{words(kind)} {fraction:.1%}" for kind, fraction in stats.fractions.items()}
+    counts["recovered"] += f" (median sigma {stats.error:.1%} of the depth)" if stats.error is not None else ""
     layout, (h, w) = task.layout, rows[0]["hw"]
     lines = [
         f"{task.scene.name}: {format_count(len(rows), 'frame')}{f' ({n_untouched} left untouched)' * (n_untouched > 0)}"
-        f" of {w}x{h}: {sensor}, {swept}, {none}{f' ({reasons})' * bool(reasons)}",
+        f" of {w}x{h}: {', '.join(counts.values())}{f' ({why})' if why else ''}",
         f"  depth in steps of {1e3 * layout.unit:g} mm, up to {layout.reach:.1f} m"
         + (f": {unfit:.2%} of the pixels are beyond it and left empty (see unit=, arrays=true)" if unfit else ""),
     ]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.cli.layouts import Layout
-from dhtorch.codes import Gate, Source, names
+from dhtorch.codes import Gate, Source, count_kinds, names
 from dhtorch.data.io import decode as data_files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
@@ -33,9 +33,6 @@ _FORMAT_VERSION = 1
 
 #: Folder of derived files → their suffixes.
 EXTRA_FILES = {"figures": (".png",), "previews": (".jpg",), "points": (".ply", ".glb")}
-
-#: Names of the sources of a pixel whose depth is estimated from images, in a frame's meta file.
-ESTIMATED = ("swept", "recovered", "filled")
 
 
 @dataclass(frozen=True)
@@ -222,6 +219,6 @@ def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndar
     return maps, data_files.read_image(layout.file(task.folder, "source", name))[0]
 
 
-def count_estimated(pixels: Mapping[str, int]) -> int:
-    """Number of pixels with a depth from images, of a meta file's numbers of pixels by source."""
-    return sum(pixels.get(name, 0) for name in ESTIMATED)
+def count_pixels(row: Row) -> dict[str, int]:
+    """Numbers of pixels by kind, see :data:`dhtorch.codes.SOURCES_OF_KIND`, of a meta row."""
+    return count_kinds({code: row["pixels"].get(name.lower(), 0) for code, name in names(Source).items()})

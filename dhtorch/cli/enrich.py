@@ -426,10 +426,10 @@ def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, comp
     lines = [
         f"{work.out}: {format_count(len(owns), 'episode')}{kept}, {format_count(frames, 'frame')}, {size / 1e6:.1f} MB"
     ]
-    for name, shares, reasons in enrich_page.summarise_cameras(owns):
-        kinds = ", ".join(f"{kind.replace('_', ' ')} {share:.1%}" for kind, share in shares.items())
-        breakdown = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
-        lines.append(f"  {name}: {kinds}" + (f" ({breakdown})" if breakdown else ""))
+    for camera in enrich_page.summarise_cameras(owns):
+        kinds = ", ".join(f"{words(kind)} {fraction}" for kind, fraction in camera.format_kinds().items())
+        breakdown = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in camera.reasons.items())
+        lines.append(f"  {camera.name}: {kinds}" + (f" ({breakdown})" if breakdown else ""))
     lines += [f"  {line}" for line in (*enrich_page.describe_refuted_poses(owns), *work.notes)]
     lines += [f"  {complaint}" for complaint in complaints[:_MAX_COMPLAINTS]]
     lines += [f"  and {len(complaints) - _MAX_COMPLAINTS} more frames"] if len(complaints) > _MAX_COMPLAINTS else []

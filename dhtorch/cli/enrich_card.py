@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.cli.enrich_page import summarise_cameras
-from dhtorch.codes import Source, names
+from dhtorch.codes import SOURCES_OF_KIND, Source, names, words
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import import_optional
 from dhtorch.extract.origin import SOURCE_CARD
@@ -62,22 +62,20 @@ def _camera_table(target: LeRobotTarget, owns: Sequence[Mapping[str, Any]], stat
         "picture",
         "map",
         "fx, fy, cx, cy (px)",
-        "sensor",
-        "recovered",
-        "none",
+        *map(words, SOURCES_OF_KIND),
         "depth (m)",
         "sigma (m)",
     )
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    shares = {name: kinds for name, kinds, _ in summarise_cameras(owns)}
+    cameras = {camera.name: camera for camera in summarise_cameras(owns)}
     K = _first_intrinsics(target)
     for key, view in target.views.items():
-        kinds = shares.get(view.name, {})
-        percent = [f"{kinds.get(kind, 0.0):.1%}" for kind in ("sensor", "recovered", "no_answer")]
+        camera = cameras.get(view.name)
+        percent = ["0.0%"] * len(SOURCES_OF_KIND) if camera is None else camera.format_kinds().values()
         numbers = K.get(key)
         lens = "unknown" if numbers is None else ", ".join(f"{x:.1f}" for x in numbers)
         depth, sigma = (stats.get(target.keys[key].get(name, "")) for name in ("depth", "sigma"))
-        span = "–" if not kinds or kinds["no_answer"] == 1 or depth is None else _span(depth)
+        span = "–" if camera is None or camera.kinds["no_answer"] == 1 or depth is None else _span(depth)
         typical = "–" if span == "–" or sigma is None else f"{float(np.ravel(sigma['q50'])[0]):.4f}"
         sizes = [f"{w}×{h}" for h, w in (view.hw, view.map_hw)]
         lines.append(f"| {' | '.join([f'`{key}`', *sizes, lens, *percent, span, typical])} |")

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import add
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dhtorch.cli.gate_messages import describe_gate
-from dhtorch.codes import Gate, Source, names
+from dhtorch.codes import SOURCES_OF_KIND, Gate, Source, count_kinds, names, words
 from dhtorch.experiments.report.figure import Figure
 from dhtorch.experiments.report.page import PAGE_CSS, figures_markup, table_markup
 from dhtorch.experiments.report.tables import ReportTable
+from dhtorch.export.lerobot import LogHistogram
 from dhtorch.extract.enriched import NO_ANSWER_REASONS, NO_OTHER_VIEW
 from dhtorch.extract.origin import REPORT_FILES
 from dhtorch.extract.targets import UNKNOWN_CONVENTION
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import Axis, LegendKey, Panel
-from dhtorch.viz.plots.colours import GATE_COLOURS, RECOVERED, SENSOR, SOFT, UNANSWERED, Stroke
+from dhtorch.viz.plots.colours import FILLED, GATE_COLOURS, RECOVERED, SENSOR, SOFT, UNANSWERED, Stroke
 from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import make_tag
 
@@ -35,22 +39,34 @@ _MAX_DRAWN_REASONS = 4
 #: Smallest fraction of the pixels of a reason that is listed.
 _MIN_REASON_SHARE = 5e-4
 
-#: Kind of a pixel → its source codes.
-_CODES_OF_KIND = {
-    "sensor": (Source.SENSOR,),
-    "recovered": (Source.RECOVERED, Source.SWEPT, Source.FILLED),
-    "no_answer": (Source.NONE,),
-}
 _REASON_COLOURS = {**GATE_COLOURS, NO_OTHER_VIEW: SOFT}
-_KIND_COLOURS = {"sensor": SENSOR, "recovered": RECOVERED, "no_answer": UNANSWERED}
+_KIND_COLOURS = {"recovered": RECOVERED, "filled": FILLED, "sensor": SENSOR, "no_answer": UNANSWERED}
 
 
-def summarise_cameras(owns: Sequence[Row]) -> list[tuple[str, dict[str, float], dict[str, float]]]:
-    """Per camera: name, fraction of pixels by kind, fraction of unanswered pixels by gate (largest first)."""
-    return [
-        (name, *_pixel_shares([own["cameras"][name] for own in owns if name in own["cameras"]]))
-        for name in _list_cameras(owns)
-    ]
+class CameraSummary(NamedTuple):
+    """Outcome of the pixels of one camera."""
+
+    name: str
+    kinds: dict[str, float]  # fractions of the pixels by kind, see codes.SOURCES_OF_KIND
+    reasons: dict[str, float]  # fractions of the pixels without an answer by gate, the largest first
+    sigma_rel: float  # median sigma / depth of the recovered pixels; NaN = none
+
+    def format_kinds(self) -> dict[str, str]:
+        """The fractions as text, with the median sigma of the recovered pixels."""
+        shown = {kind: f"{fraction:.1%}" for kind, fraction in self.kinds.items()}
+        if self.kinds["recovered"] and math.isfinite(self.sigma_rel):
+            shown["recovered"] += f" (median sigma {self.sigma_rel:.1%} of the depth)"
+        return shown
+
+
+def summarise_cameras(owns: Sequence[Row]) -> list[CameraSummary]:
+    """Outcome of the pixels per camera."""
+    summaries = []
+    for name in _list_cameras(owns):
+        rows = [own["cameras"][name] for own in owns if name in own["cameras"]]
+        bins = [LogHistogram.parse(row["recovered_sigma_rel_bins"]) for row in rows]
+        summaries.append(CameraSummary(name, *_pixel_shares(rows), reduce(add, bins).quantile(0.5)))
+    return summaries
 
 
 def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
@@ -108,11 +124,11 @@ def _build_page(about: Row, owns: Sequence[Row]) -> str:
 def _pixel_shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
     readable = [c for c in cameras if c["pixels"]]
     if not readable:
-        return dict.fromkeys(_CODES_OF_KIND, 0.0) | {"no_answer": 1.0}, {}
+        return dict.fromkeys(SOURCES_OF_KIND, 0.0) | {"no_answer": 1.0}, {}
     pixels = np.sum([np.array(c["pixels"], float) for c in readable], 0)
     no_answer = np.sum([np.array(c["no_answer"], float) for c in readable], 0)
     total = max(1.0, float(np.sum(pixels)))
-    kinds = {kind: float(sum(pixels[code] for code in codes)) / total for kind, codes in _CODES_OF_KIND.items()}
+    kinds = {kind: float(n) / total for kind, n in count_kinds(pixels).items()}
     gates = {name: float(no_answer[code]) / total for code, name in NO_ANSWER_REASONS.items() if code != Gate.ANSWER}
     return kinds, {
         name: share for name, share in sorted(gates.items(), key=lambda x: -x[1]) if share >= _MIN_REASON_SHARE
@@ -133,10 +149,11 @@ def _describe_readings(refuted: Mapping[str, int]) -> str:
 
 def _build_camera_table(owns: Sequence[Row]) -> ReportTable:
     rows = []
-    for name, kinds, reasons in summarise_cameras(owns):
-        breakdown = "; ".join(f"{describe_gate(gate)} {share:.1%}" for gate, share in reasons.items())
-        rows.append([name, breakdown or "—", *(f"{share:.1%}" for share in kinds.values())])
-    return ReportTable("Pixels by camera", ["camera", "no answer because", *_CODES_OF_KIND], rows, n_label=2)
+    for camera in summarise_cameras(owns):
+        breakdown = "; ".join(f"{describe_gate(gate)} {share:.1%}" for gate, share in camera.reasons.items())
+        rows.append([camera.name, breakdown or "—", *camera.format_kinds().values()])
+    head = ["camera", "no answer because", *map(words, SOURCES_OF_KIND)]
+    return ReportTable("Pixels by camera", head, rows, n_label=2)
 
 
 def _build_refuted_table(owns: Sequence[Row]) -> ReportTable:
@@ -171,7 +188,7 @@ def _build_worst_table(owns: Sequence[Row]) -> ReportTable:
     ]:
         reason = next((describe_gate(gate) for gate in reasons), "—")
         rows.append([str(number), name, reason, *(f"{share:.1%}" for share in kinds.values()), str(unread)])
-    head = ["episode", "camera", "most frequent reason for no answer", *_CODES_OF_KIND, "frames not read"]
+    head = ["episode", "camera", "most frequent reason for no answer", *map(words, SOURCES_OF_KIND), "frames not read"]
     return ReportTable("Episodes with least depth first", head, rows, n_label=3)
 
 
@@ -180,10 +197,10 @@ def _build_time_figure(owns: Sequence[Row]) -> Figure | None:
     panels = []
     for name, mean in _average_over_episodes(owns, "over_time"):
         panel = _make_share_panel(name)
-        for kind, codes in _CODES_OF_KIND.items():
-            _draw_shares(panel, sum(mean[code] for code in codes), _KIND_COLOURS[kind])
+        for kind, fractions in count_kinds(mean).items():
+            _draw_shares(panel, fractions, _KIND_COLOURS[kind])
         panels.append(panel)
-    keys = [LegendKey(kind, colour, "line") for kind, colour in _KIND_COLOURS.items()]
+    keys = [LegendKey(words(kind), colour, "line") for kind, colour in _KIND_COLOURS.items()]
     return Figure("Over time", "Mean over the episodes, by camera.", panels, keys) if panels else None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import gate_messages as reasons
 from dhtorch.cli.completed_folder import CompletionTask, Row
-from dhtorch.codes import is_estimated
+from dhtorch.codes import SOURCES_OF_KIND, is_recovered, words
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.recording import Recording
 from dhtorch.runtime.console import format_count
@@ -32,49 +32,37 @@ class RecoveryStats:
     """Statistics of the completed frames of one recording; fractions are of all their pixels."""
 
     frames: int
-    sensor: float
-    recovered: float
-    no_answer: float
-    pixels: float  # recovered pixels per frame
+    fractions: Mapping[str, float]  # by kind, see codes.SOURCES_OF_KIND
+    pixels: Mapping[str, float]  # per frame, by kind
     reasons: tuple[tuple[str, float], ...]  # gate names and fractions of all pixels, the largest first
     near: float | None = None  # m; 2 % and 98 % percentile of recovered depth; None = nothing recovered
     far: float | None = None
-    error: float | None = None  # median stated sigma / depth
+    error: float | None = None  # median stated sigma / depth of the recovered pixels
 
 
 def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoveryStats:
     """Statistics of complete frames."""
     rows = [task.done[task.name(i)] for i in frames]
-    totals = [sum(row["pixels"].values()) for row in rows]
-
-    def n_of(row: Row, kind: str) -> int:
-        pixels: Mapping[str, int] = row["pixels"]
-        return completed.count_estimated(pixels) if kind == "swept" else pixels.get(kind, 0)
-
-    fraction = {
-        kind: float(np.mean([n_of(row, kind) / n for row, n in zip(rows, totals, strict=True)]))
-        for kind in ("sensor", "swept", "none")
-    }
-    pixels = sum(n_of(row, "swept") for row in rows) / len(rows)
+    counts = [completed.count_pixels(row) for row in rows]
+    fractions = {kind: float(np.mean([n[kind] / sum(n.values()) for n in counts])) for kind in SOURCES_OF_KIND}
+    pixels = {kind: sum(n[kind] for n in counts) / len(counts) for kind in SOURCES_OF_KIND}
     depth_stats: dict[str, float] = {}
-    depth, ratio = _read_swept_pixels(task, frames)
+    depth, ratio = _read_recovered_pixels(task, frames)
     if len(depth):
         near, far = np.percentile(depth, (2, 98)).tolist()
         depth_stats = {"near": near, "far": far, "error": float(np.median(ratio))}
     reasons = tuple(sorted(_average_no_answer_shares(rows).items(), key=lambda item: -item[1]))
-    return RecoveryStats(
-        len(rows), fraction["sensor"], fraction["swept"], fraction["none"], pixels, reasons, **depth_stats
-    )
+    return RecoveryStats(len(rows), fractions, pixels, reasons, **depth_stats)
 
 
-def _read_swept_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and sigma / depth of the swept pixels of the first ``_MAX_MEASURED_FRAMES`` frames."""
+def _read_recovered_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and sigma / depth of the recovered pixels of the first ``_MAX_MEASURED_FRAMES`` frames."""
     depth, ratio = [np.zeros(0)], [np.zeros(0)]
     for i in frames[:_MAX_MEASURED_FRAMES]:
         maps, source = completed.read_completed_maps(task, i)
-        swept = is_estimated(source) & (maps["depth"] > 0)
-        depth.append(maps["depth"][swept])
-        ratio.append(maps["sigma"][swept] / maps["depth"][swept])
+        recovered = is_recovered(source) & (maps["depth"] > 0)
+        depth.append(maps["depth"][recovered])
+        ratio.append(maps["sigma"][recovered] / maps["depth"][recovered])
     return np.concatenate(depth), np.concatenate(ratio)
 
 
@@ -93,15 +81,19 @@ def describe_recovery(
     """Printed sentences: the capture (images (h, w)), and what was recovered, else what its check shows."""
     recording, (h, w) = task.recording, hw
     kind = f"{task.scene.name}: a {recording.format} capture, {format_count(len(recording), 'frame')} of {w}x{h}"
+    filled = f"{stats.pixels['filled']:,.0f}" if stats.fractions["filled"] else ""
     guess = intrinsics_options.find_guess_report(recording.report)
-    sensor = f"{kind}; the sensor has depth at {stats.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
+    sensor = f"{kind}; the sensor has depth at {stats.fractions['sensor']:.0%} of the pixels"
+    sensor += f"; its {guess}." if guess else "."
     if stats.error is None:
-        blamed = bool(check.findings) and stats.no_answer > _MIN_REASON_SHARE
+        blamed = bool(check.findings) and stats.fractions["no_answer"] > _MIN_REASON_SHARE
         reason = str(check.findings[0]) if blamed else _explain_silence(stats)
-        return [sensor, f"Nothing was recovered: {reason}."]
-    amount = f"Recovered {stats.pixels:,.0f} pixels per frame without sensor depth, from {stats.near:.1f} m to"
-    frames = f"({format_count(stats.frames, 'frame')})"
-    return [sensor, f"{amount} {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth {frames}."]
+        also = f" Filled {filled} pixels per frame by interpolation." if filled else ""
+        return [sensor, f"Nothing was recovered: {reason}.{also}"]
+    amount = f"Recovered {stats.pixels['recovered']:,.0f} pixels per frame from other views, at {stats.near:.1f} m to"
+    amount += f" {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth"
+    amount += f"; filled {filled} by interpolation" if filled else ""
+    return [sensor, f"{amount} ({format_count(stats.frames, 'frame')})."]
 
 
 def describe_check(check: CaptureCheck) -> list[str]:
@@ -121,12 +113,11 @@ def describe_placing(check: CaptureCheck, recording: Recording, placed: Recordin
 
 def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes, caption: str) -> PageOpening:
     """The opening of the page; ``picture`` is the PNG of the contact sheet."""
-    shown = {"Recovered pixels per frame": f"{stats.pixels:,.0f}"}
+    shown = {"Recovered pixels per frame": f"{stats.pixels['recovered']:,.0f}"}
     if stats.error is not None:
-        shown |= {"Recovered depth range": f"{stats.near:.1f} – {stats.far:.1f} m"}
-        shown |= {"Median sigma / depth": f"{stats.error:.1%}"}
-    fractions = {"Sensor": stats.sensor, "Recovered": stats.recovered, "No answer": stats.no_answer}
-    shown |= {f"{kind}, fraction of the pixels": f"{share:.1%}" for kind, share in fractions.items()}
+        shown["Recovered, median sigma / depth"] = f"{stats.error:.1%}"
+    for kind, fraction in stats.fractions.items():
+        shown[f"{words(kind).capitalize()}, fraction of the pixels"] = f"{fraction:.1%}"
     listed = [
         f"{reasons.describe_gate(name)} ({share:.1%} of the pixels)"
         for name, share in stats.reasons

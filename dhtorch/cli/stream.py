@@ -52,6 +52,7 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
     stream = Stream(method, steps=settings["steps"], seed=settings["seed"], hint=hint)
     n = len(recording)
     rows: list[Row] = []
+    ratios = [torch.zeros(0)]
     for k in progress(range(n), f"{scene.name}: frames", n):
         frame = recording[k].to(getattr(torch, settings["dtype"])).to(settings["device"])
         frame = range_split(frame, settings["cutoff"])
@@ -63,8 +64,11 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
         row["cut"] = len(stream.cuts) > cuts
         row["back"] = sorted(trace["back"][:, 0].tolist()) if "back" in trace else []
         hole = ~(trace["samples"] if "samples" in trace else method.sample_depth_at(frame, estimate.uv[0])).usable
-        row |= {"n_holes": int(hole.sum()), "n_recovered": int((estimate.keep & hole).sum())}
+        recovered = estimate.keep & hole
+        row |= {"n_holes": int(hole.sum()), "n_recovered": int(recovered.sum())}
+        ratios.append((estimate.sigma / estimate.depth)[recovered].float().cpu())
         rows.append(row)
+    ratio = torch.cat(ratios)
     seconds = sum(row["ms"] for row in rows) / 1e3
     holes = sum(row["n_holes"] for row in rows)
     return {
@@ -73,6 +77,7 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
         "frames_per_second": n / seconds,
         "ms_median": statistics.median(row["ms"] for row in rows),
         "recovered": sum(row["n_recovered"] for row in rows) / holes if holes else None,
+        "recovered_sigma_rel": float(ratio.median()) if len(ratio) else None,
         "cuts": stream.cuts,
         "mib": stream.nbytes / 2**20,
         "frames": rows,
@@ -83,8 +88,10 @@ def _format_summary(scene: Row) -> str:
     share = (
         "every sample has a return"
         if scene["recovered"] is None
-        else f"{scene['recovered']:.1%} of the samples without a return recovered"
+        else f"{scene['recovered']:.1%} of the samples without a return recovered from other views"
     )
+    if scene["recovered_sigma_rel"] is not None:
+        share += f" (median sigma {scene['recovered_sigma_rel']:.1%} of the depth)"
     cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
     speed = f"{scene['frames_per_second']:.2f} frames/s"
     frames = format_count(scene["n_frames"], "frame")

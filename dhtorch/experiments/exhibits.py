@@ -37,7 +37,7 @@ from dhtorch.viz.viewer.exhibit import (
 #: Maximum number of points of a depth map that are shown, drawn at random.
 MAX_CLOUD_POINTS = 12_000
 
-#: Maximum number of swept pixels that are shown of one view, in rows and columns evenly spaced.
+#: Maximum number of swept and filled pixels that are shown of one view, in rows and columns evenly spaced.
 MAX_SWEPT_POINTS = 24_000
 
 #: Maximum of the longer side of the images, px.
@@ -177,7 +177,7 @@ def _return_cloud(frame: Frame, mask: torch.Tensor) -> PointCloud:
 
 
 def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
-    """Swept pixels of a map (B = 1), thinned to every second, third … row and column → points."""
+    """Swept and filled pixels of a map (B = 1), thinned to every second, third … row and column → points."""
     depth_map = depth_map.to("cpu")
     hw = depth_map.depth.shape[-2], depth_map.depth.shape[-1]
     stride = math.ceil(math.sqrt(max(1, int(is_estimated(depth_map.source).sum())) / MAX_SWEPT_POINTS))
@@ -190,7 +190,9 @@ def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
     step = stride * frame.hw[1] / hw[1]
     points, rgb, sigmas, scores = (x[0].numpy() for x in (xyz.float(), _sample_colours(frame, uv), sigma, score))
     causes = depth_map.budget.dominating.flatten(1)[0, index].to(torch.uint8).numpy()
-    return SweptPointCloud(points, rgb, sigmas, scores, step_px=step, cause=causes)
+    filled = depth_map.source.flatten(1)[0, index].numpy() == Source.FILLED
+    sources = np.where(filled, Source.FILLED, Source.SWEPT).astype(np.uint8)
+    return SweptPointCloud(points, rgb, sigmas, scores, sources, step_px=step, cause=causes)
 
 
 def _largest_cause(source: torch.Tensor, budget: SigmaBudget) -> torch.Tensor:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, PoseCode, Source, names
+from dhtorch.codes import Gate, PoseCode, Source, is_recovered, names
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.io.decode import decode_image
 from dhtorch.data.recording import Recording
@@ -125,7 +125,7 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
         "no_answer": Column(whole, (len(NO_ANSWER_REASONS),), "1", "unanswered ones by NO_ANSWER_REASONS"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
-        "ranges": Column("int32", (2, N_BINS), "1", "answered pixels by depth and by sigma, see LogHistogram"),
+        "ranges": Column("int32", (3, N_BINS), "1", "answered pixels by depth, sigma; recovered by sigma / depth"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
 
@@ -172,6 +172,8 @@ class MapRowDataset(RowDataset):
         for name in maps:
             if MAP_FILES[name].enrich == "tiff":
                 maps[name] = _quantise(maps[name], self.step / MAP_STEPS.get(name, 1))
+        recovered = is_recovered(source) & (maps["depth"] > 0)
+        measured = (maps["depth"], maps["sigma"], maps["sigma"][recovered] / maps["depth"][recovered])
         image = to_rgb_uint8(reference)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
@@ -184,7 +186,7 @@ class MapRowDataset(RowDataset):
             "no_answer": np.bincount(reason[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
             "refuted": _refuted_code(added),
             "moments": _compute_moments(maps["depth"], maps["sigma"], image),
-            "ranges": np.stack([LogHistogram.of(maps[name]).counts for name in ("depth", "sigma")]).astype(np.int32),
+            "ranges": np.stack([LogHistogram.of(x).counts for x in measured]).astype(np.int32),
             "problem": added["problem"].numpy(),
         }
         return columns if "picture" not in self.wanted else {**columns, "picture": encode_png(image)}

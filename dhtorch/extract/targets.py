@@ -48,7 +48,7 @@ class MapCounts:
         self.pixels: list[np.ndarray] = []
         self.no_answer: list[np.ndarray] = []
         self.moments: FeatureMoments | None = None
-        self.ranges: tuple[LogHistogram, LogHistogram] | None = None
+        self.ranges = [LogHistogram.parse([])] * 3  # of depth, sigma, and sigma / depth of recovered pixels
         self.refuted: Counter[str] = Counter()
         self.unread = 0
 
@@ -63,27 +63,30 @@ class MapCounts:
             self.refuted[CONVENTIONS[row["refuted"] - 1] or UNKNOWN_CONVENTION] += 1
         moments = FeatureMoments(*np.asarray(row["moments"], np.float64).reshape(5, 5))
         self.moments = moments if self.moments is None else self.moments + moments
-        depth, sigma = (LogHistogram(counts) for counts in np.asarray(row["ranges"], np.int64).reshape(2, -1))
-        self.ranges = (depth, sigma) if self.ranges is None else (self.ranges[0] + depth, self.ranges[1] + sigma)
+        ranges = np.asarray(row["ranges"], np.int64).reshape(3, -1)
+        self.ranges = [total + LogHistogram(counts) for total, counts in zip(self.ranges, ranges, strict=True)]
 
     def summary(self) -> Row:
-        """Pixels by source and by reason, in total and along time; refuted poses by the convention that they match."""
+        """Pixels by source and by reason, in total and along time; recovered ones by sigma / depth, see LogHistogram;
+        refuted poses by the convention that they match."""
         if not self.pixels:
-            no_pixels: Row = {key: [] for key in ("pixels", "no_answer", "over_time", "no_answer_over_time")}
+            keys = ("pixels", "no_answer", "over_time", "no_answer_over_time", "recovered_sigma_rel_bins")
+            no_pixels: Row = {key: [] for key in keys}
             return {**no_pixels, "unread": self.unread, "frames": 0, "refuted": {}}
         pixels, no_answer = np.stack(self.pixels), np.stack(self.no_answer)
         parts = np.array_split(np.arange(len(pixels)), min(_N_TIME_BINS, len(pixels)))
         along, reasons = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, no_answer))
         more = {"over_time": along, "no_answer_over_time": reasons, "unread": self.unread}
         more |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
+        more |= {"recovered_sigma_rel_bins": self.ranges[2].pack()}
         return {"pixels": pixels.sum(0), "no_answer": no_answer.sum(0), **more}
 
     def map_stats(self) -> dict[str, tuple[FeatureMoments, LogHistogram]]:
         """Moments and histogram of depth and sigma; empty if no frame could be read."""
-        if self.moments is None or self.ranges is None:
+        if self.moments is None:
             return {}
         moments = [FeatureMoments(*(x[k : k + 1] for x in self.moments)) for k in range(2)]
-        return dict(zip(("depth", "sigma"), zip(moments, self.ranges, strict=True), strict=True))
+        return dict(zip(("depth", "sigma"), zip(moments, self.ranges[:2], strict=True), strict=True))
 
     def image_moments(self) -> FeatureMoments | None:
         """Moments of red, green and blue; None if no frame could be read."""

@@ -84,10 +84,12 @@ def _fuse_sources(
 ) -> list[Volume]:
     """The volumes after fusion of all frames: sensor depth in each of them, swept depth in the last."""
 
-    def views(source: int) -> Iterator[DepthView]:
+    def views(source: int) -> Iterator[tuple[DepthView, Tensor]]:
         name = "sensor" if source == Source.SENSOR else "swept"
         for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
-            yield _make_view(recording, k, read(k), source, poses[k])
+            frame_map = read(k)
+            filled = frame_map.source[None] == Source.FILLED
+            yield _make_view(recording, k, frame_map, source, poses[k]), torch.where(filled, Source.FILLED, source)
 
     fuse = partial(fuse_views, max_reach=MAX_REACH_TRUNCATIONS, in_place=True)
     *finer, last = volumes
@@ -96,11 +98,11 @@ def _fuse_sources(
             last, _make_view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=MAX_REACH_TRUNCATIONS
         )
     volumes = [*finer, last]
-    for view in views(Source.SENSOR):
+    for view, _ in views(Source.SENSOR):
         volumes = [fuse(volume, view) for volume in volumes]
     *finer, last = volumes
-    for view in views(Source.SWEPT):
-        last = fuse(last, view, source=Source.SWEPT)
+    for view, source in views(Source.SWEPT):
+        last = fuse(last, view, source=source)
     return [*finer, drop_unconfirmed(last, min(_MIN_AGREEING_MAPS, len(poses)))]
 
 

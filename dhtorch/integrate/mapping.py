@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import export, integrate
-from dhtorch.codes import Source, names, words
+from dhtorch.codes import SOURCES_OF_KIND, Source, count_kinds, names, words
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
@@ -26,7 +26,7 @@ from dhtorch.integrate.level import estimate_up
 from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, PlacedFrames
 from dhtorch.integrate.scales import MAX_REACH_TRUNCATIONS, N_MAPS_FOR_VOXEL, choose_coarse_voxel, merge_surfaces
-from dhtorch.integrate.sweeps import DenseSweep, SweepStore
+from dhtorch.integrate.sweeps import DenseSweep, StoredSweep, SweepStore
 from dhtorch.metrics import bootstrap
 from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
@@ -162,8 +162,9 @@ def map_scene(
     row: Row = {"scene": recording.name, "pair": None, "method": _method_name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "cutoff_m": settings["cutoff"], "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
-    row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
+    row |= {} if sweep is None else _count_swept([a.swept for a in answers if a.swept is not None])
     row |= _coverage_columns(points, volumes[-1].voxel)
+    row |= _count_points(surface) | {"recovered_sigma_rel": _median_sigma_rel(answers)}
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
     row |= {"volume_mib": sum(v.bytes for v in volumes) / 2**20}
     row |= {"voxel_m": settings["voxel"], "cell_m": volumes[-1].voxel}
@@ -230,8 +231,23 @@ def _fuse_sources(
 def _swept_sigmas(answers: Sequence[PairEstimate]) -> Tensor:
     """Standard deviations (P,) m of the swept depth of the first maps; without maps, of the recovered points."""
     maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
-    sigmas = [sigma[depth > 0] for depth, sigma, _ in maps]
+    sigmas = [sigma[depth > 0] for depth, sigma, *_ in maps]
     return torch.cat(sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)])
+
+
+def _median_sigma_rel(answers: Sequence[PairEstimate]) -> float | None:
+    """Median sigma / depth of the recovered pixels of the first maps; without maps, of the recovered points."""
+    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
+    ratios = [(sigma / depth)[source == Source.SWEPT] for depth, sigma, _, source in maps]
+    ratios = ratios or [(a.estimate.sigma / a.estimate.depth)[a.recovered] for a in answers]
+    ratio = torch.cat([torch.zeros(0), *ratios])
+    return float(ratio.median()) if len(ratio) else None
+
+
+def _count_points(surface: integrate.Surface) -> Row:
+    """Numbers of points by kind of their source."""
+    kinds = count_kinds(surface.source.bincount(minlength=len(names(Source))).tolist())
+    return {f"n_points_{kind}": n for kind, n in kinds.items() if kind != "no_answer"}
 
 
 def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
@@ -366,7 +382,7 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
     return [
         {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
         | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in scene.places.poses)}
-        | ({} if a.swept is None else {"n_swept": a.swept.n, "map_hw": list(a.swept.hw)})
+        | ({} if a.swept is None else {**_count_swept([a.swept]), "map_hw": list(a.swept.hw)})
         | ({} if a.picked is None else a.picked.row())
         for a in scene.answers
     ]
@@ -382,7 +398,11 @@ def _describe_scene(row: Row, cell: float) -> str:
     ratio = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
     ratio += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
     islands = f"{format_count(row['n_islands'], 'island')}, the largest {row['largest_island']:.0%}"
-    size = f"{row['n_points']:,} points" + (f", {row['n_triangles']:,} triangles" if row["n_triangles"] else "")
+    kinds = {kind: f"{kind} {row[f'n_points_{kind}']:,}" for kind in SOURCES_OF_KIND if kind != "no_answer"}
+    if row["recovered_sigma_rel"] is not None:
+        kinds["recovered"] += f" (median sigma {row['recovered_sigma_rel']:.1%} of the depth)"
+    size = f"{row['n_points']:,} points: {', '.join(kinds.values())}"
+    size += f"; {row['n_triangles']:,} triangles" if row["n_triangles"] else ""
     return (
         f"{row['scene']}: {placed}, {fragments};"
         f" {format_count(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{ratio}, {islands};"
@@ -392,6 +412,11 @@ def _describe_scene(row: Row, cell: float) -> str:
 
 def _n_recovered(answers: Iterable[PairEstimate]) -> int:
     return sum(int(answer.recovered.sum()) for answer in answers)
+
+
+def _count_swept(maps: Sequence[StoredSweep]) -> Row:
+    """Numbers of pixels of dense maps from other views, and interpolated."""
+    return {"n_swept": sum(each.n - each.n_filled for each in maps), "n_filled": sum(each.n_filled for each in maps)}
 
 
 def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Row], scenes: list[Row]) -> Row:

@@ -55,7 +55,7 @@ def draw_map(
     picture = torch.where(view.depth[0, ..., None] > 0, view.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(camera, camera_path)[camera_path[..., 2] > voxel].numpy()
     counts = {code: int((surface.source == code).sum()) for code in VOLUME_SOURCES}
-    shown_counts = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
+    shown_counts = {code: n for code, n in counts.items() if n or code in (Source.SENSOR, Source.RECOVERED)}
     *first, last = (words(names(Source)[code]) for code in shown_counts)
     sources = f"{', '.join(first)} and {last}".capitalize()
     pictures = {

@@ -271,7 +271,8 @@ def fuse_recording_grids(
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
-            volume = fuse(volume, view_from_sweep(recording, answer, places), source=Source.SWEPT)
+            source = answer.swept.read()[-1]
+            volume = fuse(volume, view_from_sweep(recording, answer, places), source=source)
         volume = drop_unconfirmed(volume, max(1, min(min_maps, len(maps))))
         after(Source.SWEPT, [*finer, volume])
     return [*finer, volume]
@@ -356,7 +357,7 @@ def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFr
     """Depth view of the swept pixels of a reference view's map, with colours of its image."""
     assert answer.swept is not None
     return view_from_depth_map(
-        recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]]
+        recording[answer.pair[0]], *answer.swept.read()[:3], T_world_from_cam=places.poses[answer.pair[0]]
     )
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.calibration.score_calibration import Calibration
-from dhtorch.codes import is_estimated
+from dhtorch.codes import Source, is_estimated
 from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
@@ -59,26 +59,27 @@ class DenseSweep:
 
 @dataclass(frozen=True, eq=False)
 class StoredSweep:
-    """The swept pixels of one frame's map (B = 1), stored in a file."""
+    """The swept and filled pixels of one frame's map (B = 1), stored in a file."""
 
     file: IO[bytes]
     offset: int
     hw: tuple[int, int]
-    n: int  # number of swept pixels that are kept
+    n: int  # number of pixels that are kept
+    n_filled: int  # those of them that are filled
 
-    def read(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth and sigma in m, and score, (1, h, w) each, float32; 0 in other pixels."""
+    def read(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Depth and sigma in m, score, and SWEPT or FILLED, (1, h, w) each, float32; 0 in other pixels."""
         self.file.seek(self.offset)
         h, w = self.hw
-        stored = np.frombuffer(self.file.read(3 * h * w * 2), np.float16).reshape(3, 1, h, w)
-        depth, sigma, score = torch.from_numpy(stored.astype(np.float32))
-        return depth, sigma, score
+        stored = np.frombuffer(self.file.read(4 * h * w * 2), np.float16).reshape(4, 1, h, w)
+        depth, sigma, score, source = torch.from_numpy(stored.astype(np.float32))
+        return depth, sigma, score, source
 
 
 class SweepStore:
     """Temporary file with the dense maps of a recording, deleted when no reference to it is left.
 
-    Disk: six bytes a pixel. A killed process leaves no file behind.
+    Disk: eight bytes a pixel. A killed process leaves no file behind.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -87,7 +88,7 @@ class SweepStore:
         self._file: IO[bytes] | None = None
 
     def put(self, depth_map: DepthMap, *, edge_rel: float = 0.1) -> StoredSweep:
-        """Store the swept pixels of a map (B = 1), except those beside a depth step of more than ``edge_rel``.
+        """Store the swept and filled pixels of a map (B = 1), except beside a depth step of more than ``edge_rel``.
 
         Pixels there without a return were fitted in a window that reaches over the step, and may belong to either side.
         """
@@ -97,11 +98,14 @@ class SweepStore:
             self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the store)
         depth = torch.where(depth_map.keep, depth_map.depth, 0.0)
         keep = depth_map.keep & is_estimated(depth_map.source) & (depth_step_rel(depth) <= edge_rel)
-        values = torch.cat((depth, depth_map.sigma, depth_map.score))
+        filled = depth_map.source == Source.FILLED
+        source = torch.where(filled, Source.FILLED, Source.SWEPT)
+        values = torch.cat((depth, depth_map.sigma, depth_map.score, source))
         stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
         offset = self._file.seek(0, 2)
         self._file.write(stored.tobytes())
-        return StoredSweep(self._file, offset, (depth.shape[-2], depth.shape[-1]), int(keep.sum()))
+        counts = int(keep.sum()), int((keep & filled).sum())
+        return StoredSweep(self._file, offset, (depth.shape[-2], depth.shape[-1]), *counts)
 
 
 def depth_step_rel(

@@ -28,7 +28,7 @@ BLOCK_VOXELS = BLOCK_SIDE**3
 #: Blocks updated at a time; bounds the memory of intermediate results.
 _BLOCKS_PER_CHUNK = 1024
 #: Sources of depth with separate weights, in the order of ``Volume.weight``.
-VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
+VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT, Source.FILLED)
 #: What the weight of an observation follows: the variance of its depth, or its confidence.
 WEIGHTINGS = ("variance", "confidence")
 
@@ -40,8 +40,8 @@ class Volume(Record):
 
     key: Tensor  # (K,) int64, rising: packed positions of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
-    weight: Tensor  # (K, 512, 3) 1/m², of sensor, recovered and swept depth; 0 = unobserved
-    n_swept: Tensor  # (K, 512) uint8: number of swept views with a surface within reach; 255 = 255 or more
+    weight: Tensor  # (K, 512, 4) 1/m², of the depths of VOLUME_SOURCES; 0 = unobserved
+    n_swept: Tensor  # (K, 512) uint8: number of swept or filled views with a surface within reach; 255 = 255 or more
     features: Tensor  # (K, 512, 1 + C) float16: fraction of the weight with features, and that times their mean
     voxel: float  # m
     truncation: float  # m
@@ -98,7 +98,7 @@ def fuse_views(
     volume: Volume,
     view: DepthView,
     *,
-    source: int = Source.SENSOR,
+    source: int | Tensor = Source.SENSOR,
     max_reach: float = 3.0,
     carve: bool = True,
     weight: str = "variance",
@@ -114,7 +114,7 @@ def fuse_views(
     Args:
         volume: of all views fused so far.
         view: B views, fused in their order.
-        source: of their depth, Source.SENSOR, RECOVERED or SWEPT; selects the weight that is increased.
+        source: of their depth, one of VOLUME_SOURCES, or (B, h, w) of each pixel; selects the weight that is increased.
         max_reach: in truncations; depth whose twofold sigma exceeds it is left out.
         carve: False = voxels in front of the surface by more than the reach are unchanged.
         weight: ``variance``, 1/sigma²; ``confidence``, the last feature of a pixel, 0 to 1, over the squared side of a
@@ -134,15 +134,14 @@ def fuse_views(
     confidence: paper, "Global integration (scope note)".
     """
     _check_view(volume, view)
-    if source not in VOLUME_SOURCES:
-        raise ValueError(f"fuse_views: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
+    channel = _find_channels(source, view.depth)
     if weight not in WEIGHTINGS:
         raise ValueError(f"weight: found {weight!r}, expected {' or '.join(WEIGHTINGS)}")
     with torch.no_grad():
         integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach, weight) for b in range(len(view.depth))]
         volume = _grow(volume, [i.blocks() for i in integrators], copy=not in_place)
-        for integrator in integrators:
-            integrator.add_to(volume, VOLUME_SOURCES.index(source), carve)
+        for integrator, channels in zip(integrators, channel.flatten(1), strict=True):
+            integrator.add_to(volume, channels, carve)
     return volume
 
 
@@ -161,7 +160,8 @@ def reserve_blocks(volume: Volume, view: DepthView, *, max_reach: float = 3.0) -
 
 
 def drop_unconfirmed(volume: Volume, least: int = 2) -> Volume:
-    """The volume without voxels of swept depth alone that fewer than ``least`` swept views confirm; called at the end.
+    """The volume without voxels of swept and filled depth alone that fewer than ``least`` such views confirm; called at
+    the end.
 
     A view with a wrong pose is wrong in all its pixels, and neighbouring pixels have similar errors; a surface that a
     second reference view with other source views shows as well is seldom wrong in the same way.
@@ -272,15 +272,15 @@ class _ViewIntegrator:
             blocks.append(sparse_grid.occupied_cells(world + along[:, None] * direction, side))
         return torch.cat(blocks).unique()
 
-    def add_to(self, volume: Volume, source: int, carve: bool) -> None:
-        """Update a volume in place; the caller owns the copy."""
+    def add_to(self, volume: Volume, channels: Tensor, carve: bool) -> None:
+        """Update a volume in place, the weights ``channels`` (h · w,) of the pixels; the caller owns the copy."""
         corner = sparse_grid.unpack_cells(volume.key).double() * BLOCK_SIDE * self.voxel
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
         local = torch.cartesian_prod(*(torch.arange(BLOCK_SIDE, device=corner.device),) * 3).double() * self.voxel
         local = (local @ self.R).to(self.depth.dtype)
         for part in self._in_sight(corner, local).split(_BLOCKS_PER_CHUNK):
             xyz = corner[part].to(local.dtype)[:, None] + local  # (k, 512, 3)
-            self._update(volume, part, xyz, source, carve)
+            self._update(volume, part, xyz, channels, carve)
 
     def _in_sight(self, corner: Tensor, local: Tensor) -> Tensor:
         """Blocks (k,) that may hold a voxel in the view's field and in front of its farthest surface."""
@@ -292,7 +292,7 @@ class _ViewIntegrator:
         in_field = centre[:, :2].abs() <= extent * z[:, None] + radius * (1 + extent.square()).sqrt()
         return ((z > -radius) & (z < farthest + radius) & in_field.all(-1)).nonzero()[:, 0]
 
-    def _update(self, volume: Volume, part: Tensor, xyz: Tensor, source: int, carve: bool) -> None:
+    def _update(self, volume: Volume, part: Tensor, xyz: Tensor, channels: Tensor, carve: bool) -> None:
         """Update the voxels ``xyz`` (k, 512, 3) of blocks ``part``; those that the view leaves are not touched."""
         pixel, along = self._observe(xyz)
         updated = along > -self.reach[pixel]
@@ -310,10 +310,11 @@ class _ViewIntegrator:
         total = old_weight.sum(-1) + added
         fraction = added / torch.where(total > 0, total, 1.0)
         distance[voxel] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
-        weight[:, source][voxel] = old_weight[:, source] + added
-        if VOLUME_SOURCES[source] == Source.SWEPT:
-            n_swept = volume.n_swept.view(-1)
-            n_swept[voxel] += ((along <= reach) & (fade >= 0.5) & (n_swept[voxel] < 255)).byte()
+        channel = channels[pixel]
+        weight[voxel, channel] = old_weight.gather(1, channel[:, None])[:, 0] + added
+        n_swept = volume.n_swept.view(-1)
+        confirmed = (channel >= VOLUME_SOURCES.index(Source.SWEPT)) & (along <= reach) & (fade >= 0.5)
+        n_swept[voxel] += (confirmed & (n_swept[voxel] < 255)).byte()
         close = along.abs() <= self.truncation
         self._average_features(volume, voxel[close], pixel[close], fraction[close, None])
 
@@ -335,6 +336,21 @@ class _ViewIntegrator:
         features = volume.features.flatten(0, 1)
         old = features[voxel].to(fraction.dtype)
         features[voxel] = (old + fraction * (self.features[pixel] - old)).to(features.dtype)
+
+
+def _find_channels(source: int | Tensor, depth: Tensor) -> Tensor:
+    """Index in ``VOLUME_SOURCES`` (B, h, w) of the source of each pixel; 0 where there is no depth (B, h, w).
+
+    Raises:
+        ValueError: another source of a pixel with depth, or another shape.
+    """
+    codes = torch.as_tensor(source, device=depth.device)
+    if codes.ndim:
+        check("fuse_views", source=(codes, "B h w"), depth=(depth, "B h w"))
+    matches = codes.expand_as(depth)[..., None] == torch.tensor(VOLUME_SOURCES, device=depth.device)
+    if bool((~matches.any(-1) & (depth > 0)).any()):
+        raise ValueError(f"fuse_views: source is {source}, expected one of {VOLUME_SOURCES}")
+    return matches.int().argmax(-1)
 
 
 def _grow(volume: Volume, keys: list[Tensor], copy: bool = True) -> Volume:

@@ -36,7 +36,8 @@ def write_arkitscenes(
     Args:
         root: the capture's folder; its name is the video id.
         assets: what to write.
-        trajectory: frames with the poses of the trajectory. None = no trajectory, as for 24 captures.
+        trajectory: frames with the poses of the trajectory, in a world with z up. None = no trajectory, as for 24
+            captures.
     """
     for asset, frames in assets.items():
         for frame in frames:

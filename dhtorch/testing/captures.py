@@ -12,6 +12,7 @@ from dhtorch.testing import image_folders, layouts
 from dhtorch.testing.arkitscenes import write_arkitscenes
 from dhtorch.testing.ca1m import write_ca1m
 from dhtorch.testing.lerobot import write_lerobot
+from dhtorch.testing.parts import ARKIT_UP, turn_world
 from dhtorch.testing.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rlds import write_rlds
@@ -19,6 +20,9 @@ from dhtorch.testing.stray import write_stray
 
 #: Range of depth of the Record3D film in m, which limits its step: 8 m in 1530 hues. Source: chosen for rooms.
 _MP4_RANGE_M = (0.0, 8.0)
+
+#: Upwards in the world of ARKitScenes. Source: its description.
+_ARKITSCENES_UP = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,7 @@ class CaptureWriter:
     max_m: float | None = None  # largest depth that the layout holds; None = that of 16-bit codes, or no limit
     path: str = "."  # what to open, relative to the folder
     has_poses: bool = True
+    up: Sequence[float] = (0.0, -1.0, 0.0)  # in the written world; in that of the frames −y, as in the built-in scenes
     is_exact: bool = True  # images and depth come back bit for bit, apart from the step of depth
     states_unit: bool = True  # whether the layout states the unit of its depth
     wants_even_sides: bool = False  # the images are stored as a film
@@ -75,11 +80,15 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
     ),
     "polycam": CaptureWriter(write_polycam, "polycam", 1 / 1000),
     "colmap": CaptureWriter(write_colmap_capture, "colmap", 1 / 1000, states_unit=False),
-    "stray": CaptureWriter(write_stray, "stray", 1 / 1000, is_exact=False, wants_even_sides=True),
+    "stray": CaptureWriter(write_stray, "stray", 1 / 1000, up=ARKIT_UP, is_exact=False, wants_even_sides=True),
     "r3d": CaptureWriter(
-        lambda root, frames: write_r3d(root / "capture.r3d", frames), "record3d", path="capture.r3d", is_exact=False
+        lambda root, frames: write_r3d(root / "capture.r3d", frames),
+        "record3d",
+        path="capture.r3d",
+        up=ARKIT_UP,
+        is_exact=False,
     ),
-    "record3d_exr": CaptureWriter(write_record3d_exr, "record3d", is_exact=False),
+    "record3d_exr": CaptureWriter(write_record3d_exr, "record3d", up=ARKIT_UP, is_exact=False),
     "record3d_mp4": CaptureWriter(
         lambda root, frames: write_record3d_mp4(
             root / "capture.mp4", frames, depth_range=_MP4_RANGE_M, stored="yuv444p"
@@ -92,11 +101,14 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
     ),
     "arkitscenes": CaptureWriter(
         lambda root, frames: write_arkitscenes(
-            root / "41048190", {"vga_wide": frames, "lowres_depth": frames}, trajectory=frames
+            root / "41048190",
+            {"vga_wide": frames, "lowres_depth": frames},
+            trajectory=[turn_world(frame, _ARKITSCENES_UP) for frame in frames],
         ),
         "arkitscenes",
         1 / 1000,
         path="41048190",
+        up=_ARKITSCENES_UP,
         options={"upright": False},
     ),
     "ca1m": CaptureWriter(

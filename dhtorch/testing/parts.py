@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,10 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Camera, Frame, Pose
+
+#: Upwards in the world of ARKit, which the captures of phones have.
+ARKIT_UP = (0.0, 1.0, 0.0)
 
 
 def frame_to_hwc(frame: Frame) -> np.ndarray:
@@ -50,6 +54,14 @@ def rotation_to_xyzw(R: np.ndarray) -> np.ndarray:
     Q[:3, 3] = Q[3, :3] = [d[2, 1], d[0, 2], d[1, 0]]
     Q[3, 3] = np.trace(R)
     return np.linalg.eigh(Q)[1][:, -1]
+
+
+def turn_world(frame: Frame, up: Sequence[float]) -> Frame:
+    """The frame in a world turned so that its −y, upwards in the built-in scenes, becomes ``up``."""
+    if frame.T_world_from_cam is None:
+        return frame
+    turn = Pose(se3.turn_between((0.0, -1.0, 0.0), up)[None], torch.zeros(1, 3, dtype=torch.float64))
+    return frame.replace(T_world_from_cam=se3.compose(turn, frame.T_world_from_cam.to(torch.float64)))
 
 
 def pose_matrix(frame: Frame) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Test writers of Record3D's three layouts."""
+"""Test writers of Record3D's three layouts.
+
+The frames' world has y down, as the built-in scenes; it is written with y up, as ARKit has it.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,16 @@ from dhtorch.data.io.decode import import_optional
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video
-from dhtorch.testing.parts import K_matrix, frame_time_s, frame_to_hwc, pose_matrix, rotation_to_xyzw, save_file
+from dhtorch.testing.parts import (
+    ARKIT_UP,
+    K_matrix,
+    frame_time_s,
+    frame_to_hwc,
+    pose_matrix,
+    rotation_to_xyzw,
+    save_file,
+    turn_world,
+)
 
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -133,7 +145,7 @@ def _arkit_pose(frame: Frame) -> list[float]:
     """Quaternion and position of the camera in ARKit's axes."""
     if frame.T_world_from_cam is None:
         return _NO_POSE
-    c2w = pose_matrix(frame) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    c2w = pose_matrix(turn_world(frame, ARKIT_UP)) @ np.diag([1.0, -1.0, -1.0, 1.0])
     return [*map(float, rotation_to_xyzw(c2w[:3, :3])), *map(float, c2w[:3, 3])]
 
 

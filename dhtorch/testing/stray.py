@@ -13,6 +13,7 @@ from dhtorch.data.orientation import apply_symmetry
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video
 from dhtorch.testing.parts import (
+    ARKIT_UP,
     K_matrix,
     encode_depth_codes,
     encode_unfiltered_png,
@@ -21,6 +22,7 @@ from dhtorch.testing.parts import (
     pose_matrix,
     rotation_to_xyzw,
     save_file,
+    turn_world,
 )
 
 _ODOMETRY_HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw"
@@ -46,7 +48,8 @@ def write_stray(
 
     Args:
         root: folder of the capture.
-        frames: depth may have its own resolution; the image's sides must be even.
+        frames: depth may have its own resolution; the image's sides must be even. Their world has y down, as the
+            built-in scenes; it is written with y up, as the app does.
         codec: of the video; the app writes HEVC, ``libx265``.
         video: whether to write it.
         first_picture: ``hidden`` by an edit list, before time 0; or ``lost``.
@@ -73,7 +76,8 @@ def write_stray(
             save_file(
                 root / "confidence" / f"{i:06d}.png", encode_unfiltered_png(np.stack([conf] * confidence_channels, -1))
             )
-        c2w, K = pose_matrix(frame), K_matrix(frame.camera)
+        c2w = pose_matrix(turn_world(frame, ARKIT_UP))
+        K = K_matrix(frame.camera)
         cells = [*c2w[:3, 3], *rotation_to_xyzw(c2w[:3, :3])]
         cells += [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] if per_frame else []
         text = ", ".join(f"{float(cell):.17g}" for cell in cells)

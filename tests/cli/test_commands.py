@@ -1,5 +1,6 @@
 """One way to type every command: ``dhtorch COMMAND PATH [--option value | option=value ...]``, and its help."""
 
+import json
 import logging
 import re
 import shlex
@@ -12,6 +13,7 @@ from dhtorch import testing as writers
 from dhtorch.cli import commands, demo, process_capture, run
 from dhtorch.cli.commands import COMMANDS, list_options, resolve_option, to_overrides
 from dhtorch.runtime import console
+from dhtorch.runtime.ply import read_ply_vertices
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Commands that read a capture and compute maps from its frames.
@@ -155,6 +157,12 @@ def test_the_demo_goes_the_whole_way(command, monkeypatch, tmp_path):
     assert code == 0 and not err
     page = tmp_path / "d" / "result" / "view.html"
     assert page.is_file() and out.splitlines()[-1] == f"Open {page.as_uri()}"
+    glb = (page.parent / "map.glb").read_bytes()
+    chunk = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    position = chunk["accessors"][chunk["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    heights = read_ply_vertices(page.parent / "map.ply").vertex["y"]
+    for low, high in ((heights.min(), heights.max()), (position["min"][1], position["max"][1])):
+        assert -0.2 < low < 0.2 and 1.5 < high < 2.8, "the floor at height 0, the ceiling above it"
     assert command("demo", *SMALL_DEMO, "--out", "d")[0] == 0, "the capture is used again"
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("notes")

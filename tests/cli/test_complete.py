@@ -185,6 +185,14 @@ def test_figure_and_points_are_of_the_first_frame(room, numbered):
 def test_a_tum_sequence_stays_one_with_its_own_step_and_stamps(captures, tmp_path):
     out = said(captures / "stamped", tmp_path / "maps", every=2)
     assert "2 frames of 160x120" in out and "0.2 mm, up to 13.1 m" in out
+    source, depth, sigma = (
+        np.stack([pixels(p) for p in sorted((tmp_path / "maps" / kind).iterdir())])
+        for kind in ("source", "depth", "sigma")
+    )
+    recovered, filled, sensor = (np.isin(source, codes) for codes in ([2, 3], [5], [1]))
+    median = np.median(sigma[recovered] / layouts.SIGMA_STEPS_PER_DEPTH_STEP / depth[recovered])
+    counts = f"recovered {recovered.mean():.1%} (median sigma {median:.1%} of the depth)"
+    assert f"{counts}, filled {filled.mean():.1%}, sensor {sensor.mean():.1%}, no answer" in out and filled.any()
     there, back = data.open(captures / "stamped"), data.open(tmp_path / "maps")
     assert back.format == "tum" and torch.equal(back.times, there.times[::2])
     assert torch.equal(back[1].image, there[2].image) and torch.allclose(back.poses.t, there.poses.t[::2], atol=1e-9)

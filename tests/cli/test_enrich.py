@@ -396,7 +396,10 @@ def test_the_card_states_cameras_shares_and_the_licence_of_the_source(shots, tmp
     (line,) = (line for line in body.splitlines() if line.startswith(f"| `{CAMERA}`"))
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     said = capsys.readouterr().out
-    assert cells[1:3] == ["64×48", "64×48"] and f"sensor {cells[4]}, recovered {cells[5]}" in said
+    parts = [
+        f"{kind} {cell}" for kind, cell in zip(("recovered", "filled", "sensor", "no answer"), cells[4:8], strict=True)
+    ]
+    assert cells[1:3] == ["64×48", "64×48"] and ", ".join(parts) in said
     stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
     assert cells[-2] == f"{stats[DEPTH]['q01'][0][0][0]:.2f}–{stats[DEPTH]['q99'][0][0][0]:.2f}"
     K = shots[0].camera

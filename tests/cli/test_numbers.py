@@ -34,6 +34,7 @@ from dhtorch.cli import (
     view,
 )
 from dhtorch.codes import Gate, Source, State, WrongCause
+from dhtorch.export.lerobot import LogHistogram
 from dhtorch.extract import plan
 from dhtorch.extract.enriched import map_columns
 from dhtorch.geometry import se3
@@ -137,27 +138,34 @@ def test_shards_go_to_the_recording_and_episode_of_their_rows():
     ]
 
 
-def camera(pixels, no_answer):
+def camera(pixels, no_answer, sigma_rel=()):
     counts = np.zeros(max(Source.NONE, Source.SENSOR, Source.RECOVERED, Source.SWEPT, Source.FILLED) + 1, int)
     for code, n in pixels.items():
         counts[code] = n
     reasons = np.zeros(max(enrich_page.NO_ANSWER_REASONS) + 1, int)
     for code, n in no_answer.items():
         reasons[code] = n
-    return {"pixels": counts.tolist(), "no_answer": reasons.tolist()}
+    bins = LogHistogram.of(np.array(sigma_rel)).pack()
+    return {"pixels": counts.tolist(), "no_answer": reasons.tolist(), "recovered_sigma_rel_bins": bins}
 
 
 def test_a_page_counts_pixels_of_each_camera_by_their_source():
     rows = [
-        camera({Source.SENSOR: 10, Source.SWEPT: 5, Source.NONE: 5}, {Gate.NO_TRACK: 4, Gate.PARALLAX: 1}),
-        camera({Source.SENSOR: 30, Source.RECOVERED: 2, Source.FILLED: 3, Source.NONE: 45}, {Gate.NO_TRACK: 45}),
+        camera({Source.SENSOR: 10, Source.SWEPT: 5, Source.NONE: 5}, {Gate.NO_TRACK: 4, Gate.PARALLAX: 1}, [0.02] * 5),
+        camera(
+            {Source.SENSOR: 30, Source.RECOVERED: 2, Source.FILLED: 3, Source.NONE: 45}, {Gate.NO_TRACK: 45}, [0.1] * 2
+        ),
     ]
     owns = [{"cameras": {"left": rows[0], "right": rows[1]}}, {"cameras": {"left": rows[1]}}]
-    table = {name: (kinds, reasons) for name, kinds, reasons in enrich_page.summarise_cameras(owns)}
-    kinds, reasons = table["left"]
-    assert kinds == pytest.approx({"sensor": 0.4, "recovered": 0.1, "no_answer": 0.5})
-    assert list(reasons.values()) == pytest.approx([0.49, 0.01]), "the most frequent reason first"
-    assert table["right"][0] == pytest.approx({"sensor": 30 / 80, "recovered": 5 / 80, "no_answer": 45 / 80})
+    left, right = enrich_page.summarise_cameras(owns)
+    assert (left.name, right.name) == ("left", "right")
+    assert left.kinds == pytest.approx({"recovered": 0.07, "filled": 0.03, "sensor": 0.4, "no_answer": 0.5})
+    assert list(left.reasons.values()) == pytest.approx([0.49, 0.01]), "the most frequent reason first"
+    assert right.kinds == pytest.approx(
+        {"recovered": 2 / 80, "filled": 3 / 80, "sensor": 30 / 80, "no_answer": 45 / 80}
+    )
+    assert (left.sigma_rel, right.sigma_rel) == pytest.approx((0.02, 0.1), rel=0.03), "of 5 and 2 pixels, to a bin"
+    assert next(iter(right.format_kinds().values())).startswith("2.5% (median sigma 1"), "recovered leads"
     assert enrich_page._pixel_shares([{"pixels": [], "no_answer": []}])[0]["no_answer"] == 1.0
 
 
@@ -261,7 +269,8 @@ def test_pixels_are_counted_by_source_and_gaps_by_reason():
     row = complete._count_pixels(steps, SimpleNamespace(gate=gate))
     assert row["pixels"] == {"sensor": 1, "swept": 2, "none": 1}
     assert row["no_answer"] == {"parallax": 0.5, "unfit": 0.25}
-    assert completed_folder.count_estimated(row["pixels"] | {"filled": 3}) == 5
+    kinds = completed_folder.count_pixels({"pixels": row["pixels"] | {"recovered": 4, "filled": 3}})
+    assert list(kinds.items()) == [("recovered", 6), ("filled", 3), ("sensor", 1), ("no_answer", 1)]
 
 
 def test_motions_are_those_of_the_views_that_were_solved():
@@ -344,14 +353,37 @@ def test_recovery_is_averaged_over_frames_of_their_own_size(monkeypatch):
     ]
     task = SimpleNamespace(name=str, done={"0": rows[0], "1": rows[1]})
     depth = np.linspace(1, 2, 101)
-    monkeypatch.setattr(recover_page, "_read_swept_pixels", lambda *_: (depth, 0.1 * depth))
+    monkeypatch.setattr(recover_page, "_read_recovered_pixels", lambda *_: (depth, 0.1 * depth))
     stats = recover_page.measure_recovery(task, [0, 1])
     numbers = [getattr(stats, name) for name in ("near", "far", "error")]
     assert numbers == pytest.approx([1.02, 1.98, 0.15])
-    assert [stats[k] if isinstance(stats, tuple) else list(vars(stats).values())[k] for k in range(5)] == pytest.approx(
-        [2, 0.375, 0.375, 0.25, 22.5]
-    )
+    assert stats.frames == 2
+    assert stats.fractions == pytest.approx({"recovered": 0.25, "filled": 0.125, "sensor": 0.375, "no_answer": 0.25})
+    assert stats.pixels == {"recovered": 17.5, "filled": 5, "sensor": 30, "no_answer": 17.5}
     assert recover_page._average_no_answer_shares(rows) == pytest.approx({"parallax": 0.1, "no_track": 0.15})
+
+
+def test_interpolated_pixels_are_never_called_recovered():
+    scene = recording(3)
+    task = SimpleNamespace(scene=scene, recording=scene.recording)
+    fractions = {"recovered": 0.1, "filled": 0.3, "sensor": 0.4, "no_answer": 0.2}
+    pixels = {kind: 10_000 * fraction for kind, fraction in fractions.items()}
+    known = {"near": 2.04, "far": 5.0, "error": 0.037}
+    told = {}
+    for name, measured in (("some", known), ("none", {})):
+        counts = {} if measured else {"recovered": 0.0}
+        stats = recover_page.RecoveryStats(3, fractions | counts, pixels | counts, (), **measured)
+        told[name] = recover_page.describe_recovery(task, stats, (4, 6), SimpleNamespace(findings=()))[1]
+        numbers = recover_page.build_opening([], stats, b"", "").numbers
+        assert numbers["Recovered pixels per frame"] == ("1,000" if measured else "0")
+        assert (numbers["Filled, fraction of the pixels"], next(iter(numbers))) == (
+            "30.0%",
+            "Recovered pixels per frame",
+        )
+    some = "Recovered 1,000 pixels per frame from other views, at 2.0 m to 5.0 m, median sigma 3.7% of the depth"
+    assert told["some"] == f"{some}; filled 3,000 by interpolation (3 frames)."
+    assert told["none"].startswith("Nothing was recovered: ")
+    assert told["none"].endswith(" Filled 3,000 pixels per frame by interpolation.")
 
 
 # ------------------------------------------------------------------------------------------------------------- others
@@ -395,7 +427,8 @@ def test_a_stream_reports_frames_back_holes_and_speed(monkeypatch):
                 self.cuts.append(1)
             trace["back"] = torch.tensor([[2], [1]])
             trace["samples"] = SimpleNamespace(usable=torch.tensor([[True, False, False, True]]))
-            return SimpleNamespace(keep=torch.tensor([[True, True, False, False]]))
+            sigma = torch.tensor([[0.5, 0.06, torch.nan, torch.nan]])
+            return SimpleNamespace(keep=torch.tensor([[True, True, False, False]]), sigma=sigma, depth=2 + 0 * sigma)
 
     ticks = iter([0.0, 0.25, 1.0, 1.25, 2.0, 2.5])
     monkeypatch.setattr(stream, "Stream", Stream)
@@ -412,6 +445,11 @@ def test_a_stream_reports_frames_back_holes_and_speed(monkeypatch):
     ] * 3
     assert [each["cut"] for each in row["frames"]] == [False, True, False]
     assert all((each["n_holes"], each["n_recovered"]) == (2, 1) for each in row["frames"])
+    assert row["recovered_sigma_rel"] == pytest.approx(0.03), "of the sample without a return"
+    assert (
+        "50.0% of the samples without a return recovered from other views (median sigma 3.0%"
+        in stream._format_summary(row)
+    )
     assert (
         row["ms_median"] == 250.0 and row["frames_per_second"] == 3.0 and row["recovered"] == 0.5 and row["mib"] == 3.0
     )

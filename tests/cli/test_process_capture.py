@@ -12,7 +12,7 @@ from PIL import Image
 from support import stored_outputs
 
 from dhtorch import testing as writers
-from dhtorch.cli.completed_folder import count_estimated
+from dhtorch.cli.completed_folder import count_pixels
 from dhtorch.cli.process_capture import order_evenly
 from dhtorch.cli.run import main
 from dhtorch.metrics.holdout import range_split
@@ -83,9 +83,9 @@ def test_every_frame_has_a_preview_and_all_frames_are_in_the_video(made):
 def test_the_page_begins_with_the_numbers_and_the_picture(made):
     page = (made / "view.html").read_text(encoding="utf-8")
     rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
-    pixels = sum(count_estimated(row["pixels"]) for row in rows) / len(rows)
+    pixels = sum(count_pixels(row)["recovered"] for row in rows) / len(rows)
     opening = page[page.index('<section id="opening"') : page.index("<main>")]
-    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median sigma / depth" in opening
+    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Recovered, median sigma / depth" in opening
     poster = page[page.index('<section id="poster"') :]
     assert page.index("</main>") < page.index('<section id="poster"'), "the map comes first"
     assert base64.b64encode((made / "overview.png").read_bytes()).decode() in poster
@@ -99,7 +99,7 @@ def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made
     assert main(["recover", str(capture), f"out={made}", *SMALL]) == 0
     what, found, then, wrote = capsys.readouterr().out.strip().splitlines()
     assert what.startswith("kitchen: a frames_dir capture, 3 frames of 160x120; the sensor has depth at")
-    assert found.startswith("Recovered ") and " pixels per frame without sensor depth, from " in found
+    assert found.startswith("Recovered ") and " pixels per frame from other views, at " in found
     assert then.startswith("Next: ") and str(made) in wrote
     assert {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()} == before, "complete frames are kept"
     command = then.partition("on your capture: dhtorch ")[2].rstrip(".")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.box_scene import CAMERA, HW, check_same, render, walk
+from support.box_scene import CAMERA, HW, check_same, render, turned_back, walk
 from support.box_scene import pose as box_pose
 from torch import Tensor
 
@@ -46,7 +46,7 @@ def with_confidence(frames: list[Frame]) -> list[Frame]:
 @pytest.mark.parametrize("name", [name for name in EXACT if name != "rlds"])
 def test_every_layout_gives_back_the_scene(tmp_path: Path, name: str) -> None:
     writer, frames = writers.CAPTURE_WRITERS[name], with_confidence(walk(3))
-    recording = data.open(writer(tmp_path, frames), **writer.options)
+    recording = turned_back(data.open(writer(tmp_path, frames), **writer.options), writer.up)
     assert recording.format == writer.format and len(recording) == 3
     assert recording.depth_unit is not None and recording.depth_unit.is_assumed is not writer.states_unit
     assert recording.depth_unit.metres == pytest.approx(writer.step_m)
@@ -56,7 +56,7 @@ def test_every_layout_gives_back_the_scene(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", [*LOSSY, "rlds"])
 def test_every_lossy_layout_gives_back_cameras_poses_and_depth(tmp_path: Path, name: str) -> None:
     writer, frames = writers.CAPTURE_WRITERS[name], with_confidence(walk(3))
-    recording = data.open(writer(tmp_path, frames), **writer.options)
+    recording = turned_back(data.open(writer(tmp_path, frames), **writer.options), writer.up)
     assert recording.format == writer.format and len(recording) == 3
     if writer.step_m is not None and recording.depth_unit is not None:
         assert recording.depth_unit.metres == pytest.approx(writer.step_m)

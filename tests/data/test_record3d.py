@@ -29,12 +29,14 @@ from dhtorch.data.readers import record3d_video
 from dhtorch.data.readers.record3d_live import LiveFrames
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
+from dhtorch.testing import parts
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")
 pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
+Y_UP = torch.tensor([1.0, -1.0, -1.0]).double()  # of a place in the box, as it is written
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], relative: float = 1e-6) -> None:
@@ -47,8 +49,9 @@ def same_scene(recording: data.Recording, frames: list[Frame], relative: float =
         assert got.conf is None or torch.equal(got.conf, want.conf)
         assert float((got.image.float() - want.image.float()).abs().mean()) < 6  # JPEG
         assert float((got.time - (want.time - frames[0].time)).abs()) < 1e-9
-        torch.testing.assert_close(got.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
-        torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
+        T = parts.turn_world(want, parts.ARKIT_UP).T_world_from_cam
+        torch.testing.assert_close(got.T_world_from_cam.R, T.R, atol=1e-12, rtol=0)
+        torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
         assert float(off_wall(world_points(own_camera(got))).max()) < 2 * relative + 1e-5
     assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
 
@@ -207,7 +210,7 @@ def test_lost_tracking_and_short_tables(tmp_path: Path) -> None:
     rewrite(archive, table(poses=rows[:5]))
     recording = data.open(archive)
     assert recording.number.tolist() == [0, 2, 4]
-    torch.testing.assert_close(recording.poses.t[1], pose(2).t[0])
+    torch.testing.assert_close(recording.poses.t[1], pose(2).t[0] * Y_UP)
     assert recording.report == (
         "frame 5: beyond the metadata's 5 rows: left out",
         "2 frames (1, 3): its pose is not usable (tracking lost): left out",
@@ -267,7 +270,7 @@ def test_what_is_missing_or_damaged_is_left_out_and_reported(tmp_path: Path) -> 
         "frame 3: no file: left out",
         "3 frames (4, 5, 6): damaged: left out",
     )
-    torch.testing.assert_close(recording.poses.t[1], pose(7).t[0])
+    torch.testing.assert_close(recording.poses.t[1], pose(7).t[0] * Y_UP)
     torch.testing.assert_close(recording[1].camera.f, camera_of(7).f)
 
 

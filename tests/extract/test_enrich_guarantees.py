@@ -415,7 +415,7 @@ def test_counts_of_an_episode_are_sums_and_shares_along_it():
     for k in range(48):  # two to a part; the second half is all recovered
         pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
         row = {"depth": b"x", "pixels": pixels, "no_answer": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
-        row["ranges"] = np.ones((2, N_BINS))
+        row["ranges"] = np.ones((3, N_BINS))
         tally.add(row)
     tally.add(None)
     found = tally.summary()

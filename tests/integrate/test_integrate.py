@@ -236,7 +236,7 @@ def test_the_volume_that_was_fused_into_is_unchanged():
 
 
 def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
-    sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02}
+    sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02, Source.FILLED: 0.025}
     volume = make_volume(0.02, channels=1)
     for code, sigma in sigmas.items():
         volume = fuse_views(volume, wall(2.0, sigma=sigma), source=code)
@@ -351,6 +351,8 @@ def test_wrong_shapes_and_options_raise():
             fuse_views(volume, wrong)
     with pytest.raises(ValueError, match="source is 0"):
         fuse_views(volume, good, source=Source.NONE)
+    with pytest.raises(ValueError, match="fuse_views"):
+        fuse_views(volume, good, source=torch.ones_like(good.depth[:, 1:]))
     for options in ({"voxel": 0.0}, {"voxel": -1.0}, {"voxel": 0.02, "truncation": 0.01}):
         with pytest.raises(ValueError, match="expected 0 < voxel <= truncation"):
             make_volume(**options)
@@ -539,7 +541,7 @@ def test_of_two_grids_each_is_what_it_is_alone_and_frames_are_read_once(walked, 
 
 def test_memory_is_that_of_the_blocks(room):
     _, volume, _ = room
-    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 3 * 4 + 1 + (1 + 3) * 2))
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 4 * 4 + 1 + (1 + 3) * 2))
     assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
 
 
@@ -568,19 +570,20 @@ def test_swept_pixels_enter_with_their_source_and_weight_and_without_edges():
     found = box_map(frame)
     depth, source, gate = found.depth.clone(), found.source.clone(), found.gate.clone()
     depth[0, 40, 60] *= 0.8
-    source[0, :10], gate[..., :5] = Source.SENSOR, Gate.UNCERTAIN
+    source[0, :10], source[0, 60:], gate[..., :5] = Source.SENSOR, Source.FILLED, Gate.UNCERTAIN
     walked, (answer,), places = looked_around([frame], [found.replace(depth=depth, source=source, gate=gate)])
     one = recording.view_from_sweep(walked, answer, places)
     there = torch.ones_like(depth, dtype=torch.bool)
     there[0, 39:42, 59:62], there[0, :10], there[..., :5] = False, False, False
     assert torch.equal(one.depth > 0, there) and answer.swept.n == int(there.sum())
+    assert answer.swept.n_filled == int(there[0, 60:].sum()) > 100
     torch.testing.assert_close(one.depth[there], frame.depth[there], rtol=1e-3, atol=0)
     torch.testing.assert_close(one.sigma[there], torch.full_like(one.sigma[there], 0.02), rtol=1e-3, atol=0)
     assert torch.equal(one.features[..., :3], frame.image.permute(0, 2, 3, 1) / 255)
     volume = recording.fuse_recording(walked, make_volume(VOXEL), [answer], places, sources=[Source.SWEPT])
     assert float(volume.weight[..., :2].max()) == 0 and float(volume.weight[..., 2].max()) == pytest.approx(2500, 1e-2)
     surface = extract_points(volume)
-    assert set(surface.source.tolist()) == {Source.SWEPT} and len(surface.xyz) > 1000
+    assert set(surface.source.tolist()) == {Source.SWEPT, Source.FILLED} and len(surface.xyz) > 1000
     assert float((off_wall(surface.xyz) * BOX.min()).quantile(0.99)) < VOXEL / 2, "a map alone is believed"
     assert float((surface.features[:, 3] - 0.5).abs().max()) < 0.01
 
@@ -640,11 +643,12 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
     kept = [shelf.put(box_map(frame)) for frame in (frames[0], small, frames[1])]
     assert list((tmp_path / "out").iterdir()) == []
     for k, frame in ((2, frames[1]), (0, frames[0]), (1, small)):
-        depth, sigma, score = kept[k].read()
+        depth, sigma, score, source = kept[k].read()
         there = sweeps.depth_step_rel(frame.depth) <= 0.1
         assert kept[k].hw == frame.hw and kept[k].n == int(there.sum()) > 0.9 * there.numel()
         torch.testing.assert_close(depth, torch.where(there, frame.depth, 0.0), rtol=1e-3, atol=0)
-        assert torch.equal(score, 0.5 * there) and float((sigma - 0.02 * there).abs().max()) < 1e-4
+        assert torch.equal(score, 0.5 * there) and torch.equal(source, Source.SWEPT * there.float())
+        assert float((sigma - 0.02 * there).abs().max()) < 1e-4
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,17 @@ from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.integrate.level import (
     _MIN_GUESS_COSINE,
+    _UP_BY_FORMAT,
     _fit_floor_normal,
     _fit_upright_direction,
     _is_in_own_world,
     _spiral_directions,
     estimate_up,
+    mean_camera_up,
 )
 from dhtorch.records import Pose
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.testing import CAPTURE_WRITERS
 
 GUESSES = torch.nn.functional.normalize(torch.randn(12, 3, dtype=torch.float64, generator=torch.manual_seed(0)), dim=-1)
 
@@ -93,6 +97,17 @@ def test_a_phones_world_is_level_however_it_is_held(rotation):
     """Lying, upright either way round with pictures that lie, and above a table, straight down."""
     assert held("stray", rotation) == [0.0, 1.0, 0.0]
     assert held("stray", rotation, chained=True) == pytest.approx([0, -1, 0], abs=0.01), "a world of its own"
+
+
+@pytest.mark.parametrize("layout", ["stray", "r3d", "record3d_exr", "arkitscenes"])
+def test_the_room_stands_upright_where_the_format_states_which_way_is_up(layout, tmp_path):
+    writer, scene = CAPTURE_WRITERS[layout], SyntheticRoom(n_frames=2, hw=(24, 32), supersample=1)
+    recording = data.open(writer(tmp_path, list(scene)), **writer.options)
+    poses = [recording.poses[k : k + 1] for k in range(len(recording))]
+    up = estimate_up(recording, poses, torch.zeros(0, 3), 0.02)
+    assert up == list(_UP_BY_FORMAT[recording.format]), "not one that was fitted"
+    tilt = torch.rad2deg(torch.acos(mean_camera_up(poses) @ torch.tensor(up).double()))
+    assert float(tilt) < 10, "the cameras look down by 9°"
 
 
 def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():

@@ -33,13 +33,13 @@ def voxels(volume):
 
 
 def loop_fuse(volume, looks, max_reach=3.0, carve=True):
-    """What ``looks`` (view, source) leave at every voxel: distance, weights, swept surfaces, share with colour, colour,
-    whether it is sure which pixel it reads: not on a border of two, nor beyond the middle of the outermost."""
+    """What ``looks`` (view, index of the source of each pixel) leave at every voxel: distance, weights, swept surfaces,
+    share with colour, colour, whether it is sure which pixel it reads: not on a border of two, nor beyond the middle of the outermost."""
     place = voxels(volume).reshape(-1, 3).double().numpy() * volume.voxel
     n, tau = len(place), volume.truncation
-    distance, weight, swept = np.zeros(n), np.zeros((n, 3)), np.zeros(n, int)
+    distance, weight, swept = np.zeros(n), np.zeros((n, len(VOLUME_SOURCES))), np.zeros(n, int)
     colour, coloured, sure = np.zeros((n, 2)), np.zeros(n), np.ones(n, bool)
-    for view, source in looks:
+    for view, sources in looks:
         R, t = view.T_world_from_cam.R[0].numpy(), view.T_world_from_cam.t[0].numpy()
         (fx, fy), (cx, cy) = view.camera.f[0].tolist(), view.camera.c[0].tolist()
         for k in range(n):
@@ -59,6 +59,7 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
             ahead = (depth - z) * math.sqrt(x * x + y * y + z * z) / z
             if ahead <= -reach or (not carve and ahead > reach):
                 continue
+            source = sources[v, u]
             w = min(1.0, max(0.0, 2 + 2 * ahead / reach)) / sigma**2
             total = weight[k].sum() + w
             share = w / total if total else 0.0
@@ -67,7 +68,7 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
                 colour[k] += share * (view.features[0, v, u].numpy() - colour[k])
                 coloured[k] += share * (1 - coloured[k])
             weight[k, source] += w
-            swept[k] += source == 2 and -0.75 * reach <= ahead <= reach
+            swept[k] += source >= 2 and -0.75 * reach <= ahead <= reach
     return distance, weight, swept, coloured, colour, sure
 
 
@@ -77,17 +78,18 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
 )
 def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
     volume = make_volume(0.1, truncation=0.25, channels=2)
-    looks = [(looked(0), 0), (looked(1, sigma, far=1.7), 1), (looked(2, sigma), 2), (looked(3), 2)]
-    for view, source in looks:
-        which = VOLUME_SOURCES[source]
-        volume = fuse_views(volume, view, source=which, carve=carve, max_reach=max_reach)
+    index = [*(np.full(HW, k) for k in range(3)), 2 + np.indices(HW).sum(0) % 2]
+    views = [looked(0), looked(1, sigma, far=1.7), looked(2, sigma), looked(3)]
+    which = [*VOLUME_SOURCES[:3], torch.tensor(VOLUME_SOURCES)[torch.from_numpy(index[3])][None]]
+    for view, source in zip(views, which, strict=True):
+        volume = fuse_views(volume, view, source=source, carve=carve, max_reach=max_reach)
     # what was said before a block was there is not known to it: ask again, now that all blocks are
     blank = volume.replace(
         **{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "n_swept", "features")}
     )
-    for view, source in looks:
-        which = VOLUME_SOURCES[source]
-        blank = fuse_views(blank, view, source=which, carve=carve, max_reach=max_reach)
+    for view, source in zip(views, which, strict=True):
+        blank = fuse_views(blank, view, source=source, carve=carve, max_reach=max_reach)
+    looks = zip(views, index, strict=True)
     distance, weight, swept, coloured, colour, sure = loop_fuse(blank, looks, max_reach, carve)
     assert sure.mean() > 0.8 and (weight[sure] > 0).any(0).all() and (weight[sure].sum(-1) == 0).any()
     features = blank.features.flatten(0, 1).numpy()[sure]

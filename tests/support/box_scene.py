@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -92,6 +94,12 @@ def disagreement(a: Frame, b: Frame, near: float = math.inf, reach: int = 0) -> 
             best = torch.where(inside & (value > 0) & (z > 0), torch.minimum(best, error), best)
     finite = best[torch.isfinite(best)]
     return float(finite.median()), finite.numel()
+
+
+def turned_back(recording: Recording, up: Sequence[float]) -> Recording:
+    """The recording in the world of the box; in its own, ``up`` is the −y of the box."""
+    turn = Pose(se3.turn_between(up, (0.0, -1.0, 0.0))[None], torch.zeros(1, 3).double())
+    return recording if recording.poses is None else replace(recording, poses=se3.compose(turn, recording.poses))
 
 
 def check_same(got: Recording, frames: list[Frame], step: float) -> None:

@@ -313,21 +313,34 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
       $("all").click(); for (const place of ["camera", "above", "side"]) lookFrom(place);
       pick(shots[1].source.indexOf(2)); drawSpace(); drawPictures(); said.push($("sample-facts").textContent);
       said.push($("read-out").hidden ? "" : $("read-out").textContent);
-      said.push(String(before !== $("space").toDataURL()), document.querySelector("h1").textContent, document.title);
+      said.push(String(before !== $("space").toDataURL()));
+      for (const name of ["swept", "filled"]) {
+        drawSpace();
+        const all = $("space").toDataURL();
+        toggle(name, false);
+        drawSpace();
+        said.push(String(all !== $("space").toDataURL()));
+      }
+      said.push(document.querySelector("h1").textContent, document.title);
       document.body.dataset.said = JSON.stringify(said);
     """
     dom, console = chromium(tmp_path, pages.build_viewer_page(named), "--dump-dom", script=script)
     assert console == []
     attribute = re.search(r'data-said="([^"]*)"', dom)
-    first, second, sample, beside, changed, heading, title = json.loads(html.unescape(attribute[1]))
+    first, second, sample, beside, changed, *hidden, heading, title = json.loads(html.unescape(attribute[1]))
     for k, (said, least) in enumerate([(first, 0.5), (second, 0.0)]):
         s = scene.shots[k].samples
         answers = s["source"] == Source.RECOVERED
         kept = answers & (s["score"] >= least)
         assert said.startswith(f"{kept.sum()} of {answers.sum()} answers shown")
+        cloud = scene.shots[k].swept
+        for name, code in (("recovered (swept)", Source.SWEPT), ("filled", Source.FILLED)):
+            of_source = cloud.source == code
+            shown = (of_source & (np.round(65535 * cloud.score) / 65535 >= least)).sum()
+            assert f" {shown:,} of {of_source.sum():,} {name} points shown." in said
         right = np.isfinite(s["error"]) & (s["score"] >= least)
-        assert f"Of {s['candidate'].sum()} held-back returns" in said and right.any()
-    assert "recovered" in sample and "parallax" in sample and changed == "true"
+        assert f"Of {s['candidate'].sum()} held-out returns" in said and right.any()
+    assert "recovered" in sample and "parallax" in sample and {changed, *hidden} == {"true"}
     assert " m ± " in beside and "recovered, score" in beside
     assert heading == title == f"{HOSTILE} · dhtorch"
 
@@ -562,13 +575,13 @@ def test_null_stands_for_what_strict_json_cannot_hold(job):
 def test_points_of_a_file(tmp_path):
     rng = np.random.default_rng(0)
     xyz, sigma, score = rng.normal(size=(50, 3)), rng.random(50), rng.random(50)
-    source = rng.integers(1, 4, 50)
+    source = rng.choice([Source.SENSOR, Source.RECOVERED, Source.SWEPT, Source.FILLED], 50)
     export.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
     (shot,) = points.read_ply_exhibit(tmp_path / "p.ply").shots
-    dense = source == Source.SWEPT
+    dense = source >= Source.SWEPT
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
         assert np.allclose(shot.samples[name], value[~dense], atol=1e-6), name
-    for name, value in {"xyz": xyz, "sigma": sigma, "score": score}.items():
+    for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
         assert np.allclose(getattr(shot.swept, name), value[dense], atol=1e-6), name
     assert "points" in data_of(pages.build_viewer_page(points.read_ply_exhibit(tmp_path / "p.ply")))["about"]
 

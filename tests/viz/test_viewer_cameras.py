@@ -64,7 +64,10 @@ def exhibit():
         "candidate": np.array([False, False, True, False]),
     }  # fmt: skip
     swept = SweptPointCloud(
-        *(getattr(cloud(60), name) for name in ("xyz", "rgb")), np.float32([0.3, 0.6]), np.float32([0.2, 0.9])
+        *(getattr(cloud(60), name) for name in ("xyz", "rgb")),
+        np.float32([0.3, 0.6]),
+        np.float32([0.2, 0.9]),
+        np.uint8([Source.SWEPT, Source.FILLED]),
     )
     shot = PairExhibit(
         "10 11", samples, pose(1), pose(2), view_0=0, view_1=1, seen=cloud(20), held_out=cloud(40), swept=swept,
@@ -96,6 +99,8 @@ def test_a_page_places_each_camera_where_it_stood(exhibit):
         assert np.allclose(xyz, getattr(exhibit.shots[0], name).xyz, atol=1e-3)
     assert np.allclose(unpacked(shot["samples"]["score"]) / 65535, [0, 0.25, 0.5, 1], atol=1e-4)
     assert np.allclose(unpacked(shot["swept"]["score"]) / 65535, [0.2, 0.9], atol=1e-4)
+    assert unpacked(shot["swept"]["source"]).tolist() == [Source.SWEPT, Source.FILLED]
+    assert data["about"].endswith(", 1 swept and 1 filled pixels")
 
 
 class Log:
@@ -142,6 +147,7 @@ def test_a_recording_places_each_camera_and_every_point_where_it_stood(exhibit):
     assert np.allclose(points.args[0], placed(shot.samples["xyz"][2:])) and len(points.radii) == 2
     for name in ("held_out", "swept"):
         assert np.allclose(log.of(f"world/map/{name}", "Points3D").args[0], placed(getattr(shot, name).xyz))
+    assert log.of("world/map/swept", "Points3D").class_ids.tolist() == [rrd._SWEPT_CLASS, rrd._FILLED_CLASS]
     assert np.allclose(log.of("world/map/sensor", "Points3D").args[0], placed(shot.seen.xyz))
     alone = Log()
     rrd._log_points(alone, alone, replace(shot, seen=EMPTY_CLOUD))

@@ -12,7 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from dhtorch.codes import Source
+from dhtorch.codes import Source, count_kinds, names
 from dhtorch.viz.plots import colours
 from dhtorch.viz.plots.axis import Axis
 from dhtorch.viz.plots.canvas import TEXT_SIZE_PT, Canvas, save_figure
@@ -67,7 +67,7 @@ def draw_completed(
         apply_log_cmap(z, sensed, depth_axis, colours.DEPTH_CMAP),
     )
     completed_panel = (
-        f"Completed: {_format_percent(answered)}, the rest no answer",
+        f"Completed: {format_kinds(code, answered)}",
         apply_log_cmap(z, answered, depth_axis, colours.DEPTH_CMAP),
     )
     panels = (("Picture", to_unit_rgb(image)), sensor_panel, completed_panel)
@@ -172,6 +172,13 @@ def draw_scale(canvas: Canvas, axis: Axis, kind: str, left: float, width: float 
             ha="center",
         )
     canvas.text(axis.label, left + width / 2, 1, ha="center")
+
+
+def format_kinds(source: Any, answered: np.ndarray) -> str:
+    """Fractions of the pixels by kind as text, recovered first; ``answered`` (h, w): those with a depth."""
+    code = np.where(answered, as_array(source), Source.NONE).astype(np.int64)
+    counts = count_kinds(np.bincount(code.ravel(), minlength=len(names(Source))))
+    return ", ".join(f"{kind} {100 * n / code.size:.0f} %" for kind, n in counts.items() if kind != "no_answer")
 
 
 def _format_percent(mask: np.ndarray) -> str:

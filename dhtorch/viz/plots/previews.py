@@ -24,6 +24,7 @@ from dhtorch.viz.plots.maps import (
     draw_scale,
     fit_depth_axis,
     fit_sigma_axis,
+    format_kinds,
     to_unit_rgb,
 )
 
@@ -83,8 +84,7 @@ def draw_contact_sheet(path: str | Path | IO[bytes], views: Sequence[CompletedVi
     for view, height in zip(views, heights, strict=True):
         sensed, answered = view.masks
         bottom -= height + TITLE_HEIGHT_PT
-        shares = f"sensor {100 * sensed.mean():.0f} %, completed {100 * answered.mean():.0f} % of the pixels"
-        canvas.text(f"{view.label}: {shares}", 2, bottom + height + 5)
+        canvas.text(f"{view.label}: {format_kinds(view.source, answered)} of the pixels", 2, bottom + height + 5)
         z, s = as_array(view.depth), as_array(view.sigma)
         ratio = np.where(answered, s / np.where(answered, z, 1), 1)
         pictures = (

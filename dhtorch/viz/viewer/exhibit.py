@@ -37,10 +37,11 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class SweptPointCloud(PointCloud):
-    """Points of swept pixels."""
+    """Points of swept and filled pixels."""
 
     sigma: np.ndarray  # (P,) m, float32
     score: np.ndarray  # (P,) in [0, 1], float32
+    source: np.ndarray  # (P,) uint8, SWEPT or FILLED
     step_px: float = 0.0  # spacing of the pixel grid that the points form, which makes a surface; 0 = no grid
     cause: np.ndarray | None = None  # (P,) uint8, as ``cause`` of samples; None = not known
 
@@ -55,7 +56,9 @@ class DepthImage:
 
 
 EMPTY_CLOUD = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-EMPTY_SWEPT_CLOUD = SweptPointCloud(EMPTY_CLOUD.xyz, EMPTY_CLOUD.rgb, np.zeros(0, np.float32), np.zeros(0, np.float32))
+EMPTY_SWEPT_CLOUD = SweptPointCloud(
+    EMPTY_CLOUD.xyz, EMPTY_CLOUD.rgb, np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class PairExhibit:
     view_1: int | None = None
     seen: PointCloud = EMPTY_CLOUD  # input returns of the method
     held_out: PointCloud = EMPTY_CLOUD  # held-out returns, or exact depth
-    swept: SweptPointCloud = EMPTY_SWEPT_CLOUD  # swept pixels of view 0, with dense depth
+    swept: SweptPointCloud = EMPTY_SWEPT_CLOUD  # swept and filled pixels of view 0, with dense depth
     depth_image: DepthImage | None = None  # input depth of the method
     facts: Mapping[str, str] = field(default_factory=dict)
 

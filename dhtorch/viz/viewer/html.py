@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.codes import Cause, Gate, Hole, names, words
+from dhtorch.codes import Cause, Gate, Hole, Source, names, words
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
@@ -28,7 +28,7 @@ _FOLDER = Path(__file__).parent
 _SCRIPTS = ("space.js", "pictures.js", "layers.js", "page.js")
 
 #: Colours that the scripts refer to by name.
-_COLOUR_NAMES = ("SENSOR", "RECOVERED", "SWEPT", "UNANSWERED", "PALE", "HIDDEN_RETURN", "WHITE", "BLACK")
+_COLOUR_NAMES = ("SENSOR", "RECOVERED", "SWEPT", "FILLED", "UNANSWERED", "PALE", "HIDDEN_RETURN", "WHITE", "BLACK")
 _CMAP_OF_QUANTITY = {"depth": colours.DEPTH_CMAP, "score": colours.SCORE_CMAP, "error": colours.ERROR_CMAP}
 
 #: Quantisation of pixel coordinates in 16 bits, steps per px.
@@ -104,9 +104,12 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
     outcomes = [("SENSOR", "sensor", SENSOR), ("ANSWER", "recovered", RECOVERED)]
     outcomes += [(name, words(name), GATE_COLOURS[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
-    swept = sum(len(shot.swept.xyz) for shot in scene.shots)
-    about = f"{format_count(len(scene.shots), 'pair')}, {n:,} samples" if scene.views else f"{n + swept:,} points"
-    about += f", {swept} swept pixels" if scene.views and swept else ""
+    clouds = [shot.swept.source for shot in scene.shots]
+    swept, filled = (sum(int((source == code).sum()) for source in clouds) for code in (Source.SWEPT, Source.FILLED))
+    about = f"{n + swept + filled:,} points"
+    if scene.views:
+        about = f"{format_count(len(scene.shots), 'pair')}, {n:,} samples"
+        about += f", {swept:,} swept and {filled:,} filled pixels" if swept + filled else ""
     return {
         "title": scene.name,
         "about": about,
@@ -171,6 +174,7 @@ def _encode_confidence(cloud: SweptPointCloud) -> dict[str, Any]:
     return {
         "sigma": _encode_array(cloud.sigma, "f4"),
         "score": _encode_array(_quantise_scores(cloud.score), "u2"),
+        "source": _encode_array(cloud.source, "u1"),
         "cause": _encode_array(np.zeros(len(cloud.xyz), np.uint8) if cloud.cause is None else cloud.cause, "u1"),
         "step_px": cloud.step_px,
     }

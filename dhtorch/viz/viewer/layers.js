@@ -19,18 +19,18 @@ const shots = DATA.shots.map((s) => {
   const columns = Object.fromEntries(Object.entries(s.samples).map(([name, packed]) => [name, unpack(packed)]));
   for (const name of ["uv_0", "uv_1"]) columns[name] = Float32Array.from(columns[name], (v) => v / DATA.per_pixel - DATA.margin_px);
   columns.score = Float32Array.from(columns.score, (v) => v / 65535);
-  const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535), cause: unpack(s.swept.cause) };
+  const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535), source: unpack(s.swept.source), cause: unpack(s.swept.cause) };
   swept.depth = Float32Array.from({ length: swept.n }, (_, k) => DATA.views.length ? swept.xyz[3 * k + 2] : Math.hypot(...swept.xyz.subarray(3 * k, 3 * k + 3))); // a map's origin is no camera
   return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held_out: cloud(s.held_out), swept };
 });
 const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
 const causeOf = Object.fromEntries(DATA.causes.map((c) => [c.code, c])), hasCauses = shots.some((s) => s.cause.some((c) => c) || s.swept.cause.some((c) => c));
-const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), UNANSWERED = hex(DATA.colours.unanswered);
+const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), FILLED = hex(DATA.colours.filled), UNANSWERED = hex(DATA.colours.unanswered);
 const PALE = hex(DATA.colours.pale), HIDDEN_RETURN = hex(DATA.colours.hidden_return), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
 const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
 const answered = (s, k) => s.source[k] === 2;
 const hasErrors = shots.some((s) => s.error.some(Number.isFinite));
-const hasViews = DATA.views.length > 0, hasSwept = shots.some((s) => s.swept.n);
+const hasViews = DATA.views.length > 0, hasRecovered = shots.some((s) => s.source.includes(2)), [hasSwept, hasFilled] = [3, 5].map((code) => shots.some((s) => s.swept.source.includes(code)));
 const depths = () => [...everything("depth", (s, k) => s.source[k] > 0), ...shots.flatMap((s) => Array.from(s.swept.depth))];
 
 const scales = {
@@ -66,7 +66,7 @@ function returnColour(cloud, k, heldOut) {
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
-// Colour of a swept pixel: of its value on a scale, else that of the image in the tint of its source.
+// Colour of a swept or filled pixel: of its value on a scale, else that of the image in the tint of its source.
 function sweptColour(cloud, k) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb), mode = state.mode;
   if (mode === "picture") return rgb;
@@ -74,7 +74,7 @@ function sweptColour(cloud, k) {
   const value = { depth: cloud.depth[k], sigma: cloud.sigma[k] / cloud.depth[k], score: cloud.score[k] }[mode];
   if (value !== undefined) return scales[mode].colour(value).map((v) => v * (0.5 + 0.6 * grey));
   if (scales[mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
-  return SWEPT.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
+  return (cloud.source[k] === 5 ? FILLED : SWEPT).map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
 function colours(n, colour) {
@@ -187,14 +187,24 @@ function recolour() {
     const l = layers[n];
     if (!l) return;
     const own = (k) => (state.mode === "picture" ? [0, 1, 2].map((c) => s.rgb[3 * k + c] / 255) : sampleColour(s, k));
-    for (const name of ["sensor", "recovered"]) space.recolour(l[name], colours(l.groups[name].length, (k) => own(l.groups[name][k])));
-    space.recolour(l.bars, colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
-    for (const name of ["seen", "held_out"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held_out")));
-    space.recolour(l.swept, colours(s.swept.n, (k) => sweptColour(s.swept, k)));
-    if (l.grains) space.recolour(l.grains, colours(l.loose.length, (k) => sweptColour(s.swept, l.loose[k])));
+    for (const name of ["sensor", "recovered"]) space.refill(l[name], "colour", colours(l.groups[name].length, (k) => own(l.groups[name][k])));
+    space.refill(l.bars, "colour", colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
+    for (const name of ["seen", "held_out"]) space.refill(l[name], "colour", colours(s[name].n, (k) => returnColour(s[name], k, name === "held_out")));
+    space.refill(l.swept, "colour", colours(s.swept.n, (k) => sweptColour(s.swept, k)));
+    if (l.grains) space.refill(l.grains, "colour", colours(l.loose.length, (k) => sweptColour(s.swept, l.loose[k])));
     s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k)));
   });
   if (!layers.length) shots.forEach((s) => { s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k))); });
+}
+
+// Scores of swept and filled pixels, below every threshold where their source is not shown.
+function hideSwept() {
+  shots.forEach((s, n) => {
+    const l = layers[n], score = (k) => (show[s.swept.source[k] === 5 ? "filled" : "swept"] ? s.swept.score[k] : -1);
+    if (!l) return;
+    space.refill(l.swept, "score", Float32Array.from({ length: s.swept.n }, (_, k) => score(k)));
+    if (l.grains) space.refill(l.grains, "score", Float32Array.from(l.loose, score));
+  });
 }
 
 const visible = (s) => (k) => {
@@ -215,8 +225,8 @@ function drawSpace() {
       space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
     }
     if (show.held_out) space.points(l.held_out, { size: grain, smallest: 1.4 });
-    if (show.swept && l.surface) space.surface(l.swept, l.surface, { threshold });
-    if (show.swept) space.points(l.surface ? l.grains : l.swept, { size: grain, smallest: 1.4, threshold });
+    if (l.surface) space.surface(l.swept, l.surface, { threshold });
+    space.points(l.surface ? l.grains : l.swept, { size: grain, smallest: 1.4, threshold });
     if (show.recovered && l.recovered) {
       const large = 1 + 1.8 * Math.min(1, 3000 / l.recovered.n); // few points are drawn large, a dense cloud is not
       space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: (dark ? BY_NIGHT : BY_DAY).rim, rimmed: 0.75 });

@@ -50,9 +50,9 @@ function tellPair() {
 }
 
 function tellCoverage() {
-  const chosen = state.all ? shots : [shots[state.now]], total = { holes: 0, answers: 0, kept: 0, swept: 0, stay: 0 };
+  const chosen = state.all ? shots : [shots[state.now]], total = { holes: 0, answers: 0, kept: 0, swept: 0, filled: 0, stay: { swept: 0, filled: 0 } };
   const risk = { scores: [], errors: [], candidates: 0 };
-  for (const s of chosen) for (let k = 0; k < s.swept.n; k++) { total.swept++; total.stay += s.swept.score[k] >= state.threshold; }
+  for (const s of chosen) for (let k = 0; k < s.swept.n; k++) { const name = s.swept.source[k] === 5 ? "filled" : "swept"; total[name]++; total.stay[name] += s.swept.score[k] >= state.threshold; }
   for (const s of chosen) for (let k = 0; k < s.n; k++) {
     if (s.source[k] !== 1) total.holes++;
     if (s.source[k] >= 2) { total.answers++; total.kept += s.score[k] >= state.threshold; }
@@ -61,7 +61,7 @@ function tellCoverage() {
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = [total.answers ? `${total.kept.toLocaleString("en")} of ${total.answers.toLocaleString("en")} answers shown${share}.` : "", total.swept ? `${total.stay.toLocaleString("en")} of ${total.swept.toLocaleString("en")} swept points shown.` : ""].filter(Boolean).join(" ") || "Nothing was recovered beyond the sensor.";
+  const first = [total.answers ? `${total.kept.toLocaleString("en")} of ${total.answers.toLocaleString("en")} answers shown${share}.` : "", ...["swept", "filled"].map((name) => (total[name] ? `${total.stay[name].toLocaleString("en")} of ${total[name].toLocaleString("en")} ${name === "swept" ? "recovered (swept)" : name} points shown.` : ""))].filter(Boolean).join(" ") || "Nothing was recovered beyond the sensor.";
   const second = left.length ? ` Of ${risk.candidates} held-out returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
@@ -97,7 +97,7 @@ function tellColours() {
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
       : mode === "cause" ? DATA.causes.filter((c) => shots.some((s) => s.cause.includes(c.code) || s.swept.cause.includes(c.code))).map((c) => [c.colour, c.name])
       : mode === "picture" ? []
-      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.unanswered, "no answer (in the images)"]] : [])];
+      : [[DATA.colours.sensor, "sensor"], ...(hasRecovered ? [[DATA.colours.recovered, "recovered"]] : []), ...(hasSwept ? [[DATA.colours.swept, "recovered (swept)"]] : []), ...(hasFilled ? [[DATA.colours.filled, "filled"]] : []), ...(hasViews ? [[DATA.colours.unanswered, "no answer (in the images)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
   rows.push(element("p", { class: "grid-size" }, `grid: ${ground.metres} m`));
@@ -130,6 +130,7 @@ function pick(k) {
 
 function toggle(name, on = !show[name]) {
   show[name] = document.querySelector(`[data-show="${name}"]`).checked = on;
+  if (name === "swept" || name === "filled") hideSwept();
   redraw();
 }
 
@@ -230,7 +231,7 @@ const KEYS = {
   c: () => chooseColour(MODES[(MODES.findIndex(([k]) => k === state.mode) + 1) % MODES.length][0]),
   "+": () => { eye.zoom(0.9); redraw(); }, "=": () => { eye.zoom(0.9); redraw(); }, "-": () => { eye.zoom(1 / 0.9); redraw(); },
   o: () => lookFrom("over"), v: () => lookFrom("camera"), a: () => lookFrom("above"), d: () => lookFrom("side"),
-  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held_out"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"), g: () => toggle("grid"),
+  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held_out"), w: () => toggle("swept"), i: () => toggle("filled"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"), g: () => toggle("grid"),
 };
 
 function listen() {
@@ -267,7 +268,7 @@ function begin() {
   document.querySelector('[data-place="camera"]').toggleAttribute("hidden", !hasViews);
   $("no-gl").toggleAttribute("hidden", Boolean(space.gl));
   $("space").setAttribute("aria-label", `Points of ${DATA.title} in space: arrow keys turn, plus and minus zoom`);
-  for (const [name, has] of [["held_out", shots.some((s) => s.held_out.n)], ["swept", hasSwept], ["unanswered", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
+  for (const [name, has] of [["held_out", shots.some((s) => s.held_out.n)], ["recovered", hasRecovered], ["swept", hasSwept], ["filled", hasFilled], ["unanswered", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
     document.querySelector(`[data-show="${name}"]`).closest("label").toggleAttribute("hidden", !has);
   }
   listen();

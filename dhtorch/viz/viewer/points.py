@@ -19,7 +19,8 @@ _MAX_POINTS = 100_000
 def read_ply_exhibit(path: Path) -> Exhibit:
     """PLY file of :func:`dhtorch.export.write_ply` -> exhibit without images and tracks.
 
-    Missing properties default to recovered points without sigma and score. Swept points become a separate cloud.
+    Missing properties default to recovered points without sigma and score. Swept and filled points become a
+    separate cloud.
 
     Raises:
         ValueError: no PLY (text or binary little-endian) with x, y and z, or a truncated file.
@@ -42,9 +43,8 @@ def read_ply_exhibit(path: Path) -> Exhibit:
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in properties else grey for c in ("red", "green", "blue")], -1)
     swept_only = is_swept(source)
-    swept = SweptPointCloud(
-        xyz[swept_only], rgb[swept_only].astype(np.uint8), *(column[name][swept_only] for name in ("sigma", "score"))
-    )
+    columns = (*column.values(), source.astype(np.uint8))
+    swept = SweptPointCloud(xyz[swept_only], rgb[swept_only].astype(np.uint8), *(x[swept_only] for x in columns))
     missing = np.full(n, np.nan, np.float32)
     zero = np.zeros((n, 2), np.float32)
     depth = xyz[:, 2] if (xyz[:, 2] > 0).all() else np.linalg.norm(xyz, axis=1)  # the origin of a map is not a camera

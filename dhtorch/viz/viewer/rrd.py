@@ -13,7 +13,7 @@ import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.runtime import storage
-from dhtorch.viz.plots.colours import DEPTH_CMAP, GATE_COLOURS, RECOVERED, SENSOR, SWEPT, UNANSWERED, parse_rgb
+from dhtorch.viz.plots.colours import DEPTH_CMAP, FILLED, GATE_COLOURS, RECOVERED, SENSOR, SWEPT, UNANSWERED, parse_rgb
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud
 
 RRD_SUFFIXES = (".rrd",)
@@ -25,8 +25,8 @@ _MAX_RADIUS_M = 0.15
 
 #: Class of samples with a sensor return; other samples have the code of their gate.
 _SENSOR_CLASS = 100
-#: Class of swept pixels.
-_SWEPT_CLASS = 101
+#: Classes of swept and of filled pixels.
+_SWEPT_CLASS, _FILLED_CLASS = 101, 102
 
 
 def write_rrd(path: Path, scene: Exhibit) -> Path:
@@ -87,7 +87,7 @@ def _make_blueprint() -> Any:
 
 def _log_exhibit(rr: Any, stream: Any, scene: Exhibit) -> None:
     classes = [(_SENSOR_CLASS, "sensor", parse_rgb(SENSOR)), (Gate.ANSWER, "recovered", parse_rgb(RECOVERED))]
-    classes.append((_SWEPT_CLASS, "swept", parse_rgb(SWEPT)))
+    classes += [(_SWEPT_CLASS, "swept", parse_rgb(SWEPT)), (_FILLED_CLASS, "filled", parse_rgb(FILLED))]
     classes += [(code, words(names(Gate)[code]), parse_rgb(colour)) for code, colour in GATE_COLOURS.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
@@ -151,7 +151,7 @@ def _log_points(rr: Any, stream: Any, shot: PairExhibit) -> None:
 
 def _log_swept(rr: Any, stream: Any, shot: PairExhibit) -> None:
     cloud = shot.swept
-    classes = np.full(len(cloud.xyz), _SWEPT_CLASS, np.uint16)
+    classes = np.where(cloud.source == Source.FILLED, _FILLED_CLASS, _SWEPT_CLASS).astype(np.uint16)
     dots = rr.Points3D(_transform_points(shot.T_world_from_0, cloud.xyz), radii=_MIN_RADIUS_M, class_ids=classes)
     stream.log("world/map/swept", dots, rr.AnyValues(score=cloud.score, sigma=cloud.sigma))
 

@@ -179,10 +179,10 @@ class Space {
     return { n, position: this.buffer(position), colour: this.buffer(colour), score: this.buffer(score || new Float32Array(n).fill(2)) };
   }
 
-  recolour(layer, colour) {
+  refill(layer, name, data) {
     if (!layer) return;
-    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, layer.colour);
-    this.gl.bufferData(this.gl.ARRAY_BUFFER, colour, this.gl.STATIC_DRAW);
+    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, layer[name]);
+    this.gl.bufferData(this.gl.ARRAY_BUFFER, data, this.gl.STATIC_DRAW);
   }
 
   texture(image) {
