@@ -31,7 +31,8 @@ class Extend:
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         """Number of a row -> its tokens."""
         sample = self.data[int(row["id"])]
-        return {"index": row["id"], **{key: sample[f"dhtorch.{key}"].numpy() for key in ("tokens", "tokens_valid")}}
+        tokens = {key: sample[f"observation.dh_{key}"].numpy() for key in ("tokens", "tokens_valid")}
+        return {"index": row["id"], **tokens}
 
 
 def main(root: str) -> None:

@@ -102,11 +102,11 @@ def test_docstrings_arrive_whole(site):
     """Sections, our closing words, shapes from the signature, comments of fields."""
     _, pages = site
     two_view = text_of(pages["api/stages.html"])
-    assert "Gradient: depth, sigma, parallax and residual" in two_view and "Gates, first reason wins" in two_view
+    assert "Gradient: depth, sigma, parallax and residual" in two_view and "Gates, the first that applies" in two_view
     assert "min_parallax_deg ( float | None , default: 0.3 ) – rays closer to parallel" in two_view
     records = text_of(pages["api/records.html"])
     assert "(B, N, 3) m in camera 0; NaN where there is no usable return" in records
-    assert ":class:" not in two_view and ":func:" not in text_of(pages["api/transform.html"])
+    assert ":class:" not in two_view and ":func:" not in text_of(pages["api/transforms.html"])
 
 
 @pytest.mark.slow
