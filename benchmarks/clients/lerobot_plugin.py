@@ -86,7 +86,7 @@ def main() -> int:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         site, data = (install(Path(folder)), enriched_robot(Path(folder))) if known else (None, None)
-        for version in VERSIONS:
+        for version in dict.fromkeys((*VERSIONS, *known)):
             kept = [row for row in before if row["lerobot"] == version]
             none = [{"lerobot": version, "torch": None, "test": "all", "passed": None, "why": "not run"}]
             if version in known and site and data:
