@@ -4,11 +4,13 @@ Whatever draws without a generator of its own draws the same in every run: torch
 before a test file is read and again before every test, ahead of its fixtures (those of a module too). So a test's draws
 depend neither on the tests before it nor on the process that it runs in.
 
-Every test and what it starts hears Ctrl-C, too: a shell has it ignored by what runs in its background.
+Every test and what it starts hears Ctrl-C, too: a shell has it ignored by what runs in its background. Where no library
+of operators is compiled, torch is chosen, so that no command prints that there is none.
 """
 
 import gc
 import math
+import os
 import random
 import signal
 
@@ -17,8 +19,11 @@ import pytest
 import torch
 from support import computed_once
 
+from dhtorch.ops import loader
 from dhtorch.runtime import console
 
+if not any((folder / loader.file_name(loader.level())).is_file() for folder in (loader.INSTALLED, loader.cache())):
+    os.environ.setdefault(loader.SWITCH, "0")
 torch.set_num_threads(1)
 console._LINE_INTERVAL_S = math.inf  # no line of progress among the errors that a test compares, on a slow machine
 signal.signal(signal.SIGINT, signal.default_int_handler)

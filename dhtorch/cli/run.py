@@ -19,6 +19,7 @@ import re
 import shlex
 import sys
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -160,8 +161,12 @@ def _run_guarded(argv: list[str]) -> int:
 
 
 def _dispatch(argv: list[str]) -> int:
-    if argv == ["--version"] or (len(argv) == 1 and argv[0] in _HELP_FLAGS):
-        print(_format_version() if argv[0] == "--version" else commands.format_overview(EXIT_CODES))
+    if argv == ["--version"]:
+        warnings.simplefilter("ignore", ImportWarning)  # of operators that are not compiled: the line has it
+        print(_format_version())
+        return EXIT_DONE
+    if len(argv) == 1 and argv[0] in _HELP_FLAGS:
+        print(commands.format_overview(EXIT_CODES))
         return EXIT_DONE
     named = bool(argv) and argv[0] in commands.COMMANDS
     if not named and argv:
@@ -187,7 +192,7 @@ def _dispatch(argv: list[str]) -> int:
 
 def _format_version() -> str:
     """Version, and what computes the operators."""
-    operators = importlib.import_module("dhtorch.ops.loader").describe_operators()
+    operators = importlib.import_module("dhtorch.ops.loader").describe_operators(advice=True)
     return f"dhtorch {dhtorch.__version__}, operators: {operators}"
 
 
@@ -597,7 +602,7 @@ def _run_hydra_job(cfg: Any) -> Any:
     if multiprocessing.current_process().name != "MainProcess":  # of a launcher
         parent_watch.exit_with_parent()
     disable_malloc_trim()  # every frame allocates the same sizes
-    with console.escape_output():
+    with console.escape_output(), console.show_warnings_in_a_line():
         return _run_job(cfg)
 
 
@@ -607,7 +612,6 @@ def _run_job(cfg: Any) -> Any:
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
-    console.ignore_foreign_warnings()
     console.configure_logging()
     from dhtorch.cli import job  # noqa: PLC0415
     from dhtorch.data.scene import scenes_of  # noqa: PLC0415

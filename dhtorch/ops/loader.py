@@ -42,6 +42,18 @@ from dhtorch.ops import constants
 #: The command that compiles the library.
 COMMAND = "python -m dhtorch.ops"
 
+#: Lowest and highest time of torch as a multiple of that of the compiled operators, one thread. Source: a pair of
+#: ``paper`` and ``map`` and a reference view of ``auto`` in benchmarks/results/pair.json and pair_avx2.json (``python
+#: benchmarks/pair.py``), 2.9 to 7.8; a map of every pixel in dense_speed.json and dense_speed_avx2.json (``python
+#: benchmarks/dense.py``), 5.5 to 8.9.
+TIMES_SLOWER = (3, 9)
+
+#: What follows the word torch where no library is there.
+_ADVICE = (
+    f"{TIMES_SLOWER[0]} to {TIMES_SLOWER[1]} times slower on the CPU than compiled ones; "
+    f"to compile them: {COMMAND} (needs a C++ compiler)"
+)
+
 #: Environment variable: 0 leaves the library unused, 1 makes it an error if it cannot be loaded.
 SWITCH = "DHTORCH_OPS"
 
@@ -214,7 +226,8 @@ def load() -> None:
 def load_if_present() -> bool:
     """Load the library at the first call if there is one, as DHTORCH_OPS says -> whether it is loaded.
 
-    A library that is there and must not be loaded is left with one warning.
+    A library that is there and must not be loaded is left with one warning. Where there is none, the warning is an
+    ImportWarning: Python ignores these, so that only the commands, which enable them, print it.
 
     Raises:
         OSError: as :func:`load`, with DHTORCH_OPS=1.
@@ -229,6 +242,8 @@ def load_if_present() -> bool:
             raise
         if "other sources" in str(error):
             warnings.warn(f"{error} (torch is used)", stacklevel=2)
+        else:
+            warnings.warn(f"operators: torch, {_ADVICE}", ImportWarning, stacklevel=2)
     except OSError as error:
         if switch:
             raise
@@ -243,9 +258,15 @@ def is_loaded() -> bool:
     return bool(_loaded)
 
 
-def describe_operators() -> str:
-    """What computes the operators of this process: ``compiled x86-64-v4``, or ``torch``."""
-    return f"compiled {level()}" if _loaded or load_if_present() else "torch"
+def describe_operators(*, advice: bool = False) -> str:
+    """What computes the operators of this process: ``compiled x86-64-v4``, or ``torch``.
+
+    ``advice`` adds to ``torch`` that DHTORCH_OPS=0 chose it, else how much slower it is and how to compile the library.
+    """
+    if _loaded or load_if_present():
+        return f"compiled {level()}"
+    reason = f" ({SWITCH}=0)" if os.environ.get(SWITCH) == "0" else f", {_ADVICE}"
+    return f"torch{reason}" if advice else "torch"
 
 
 def check_torch_version() -> None:

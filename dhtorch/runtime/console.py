@@ -216,18 +216,19 @@ def discard_broken_pipe() -> None:
 
 @contextlib.contextmanager
 def show_warnings_in_a_line() -> Iterator[None]:
-    """Context with :func:`ignore_foreign_warnings` in which warnings are printed in one line, as errors are."""
+    """Context in which warnings of other libraries are ignored and ours are printed in one line, as errors are.
+
+    That operators are not compiled, an ImportWarning of ours, is printed unless output is quiet. Python's -W decides
+    instead where it is used.
+    """
     old_format = warnings.formatwarning
     with warnings.catch_warnings():
-        ignore_foreign_warnings()
+        if not sys.warnoptions:
+            warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")
+            action: Any = "ignore" if get_verbosity() == "quiet" else "default"
+            warnings.filterwarnings(action, category=ImportWarning, module="dhtorch")
         warnings.formatwarning = lambda message, *where, **more: f"dhtorch: warning: {message}\n"
         try:
             yield
         finally:
             warnings.formatwarning = old_format
-
-
-def ignore_foreign_warnings() -> None:
-    """Ignore warnings raised in other libraries, unless Python's -W is used."""
-    if not sys.warnoptions:
-        warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")

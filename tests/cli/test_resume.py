@@ -289,9 +289,9 @@ def test_only_our_own_warnings_are_seen(monkeypatch, asked):
     modules = ["torch.nn", "hydra.main", "dhtorchy", "dhtorch.pipeline.pair"]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        console.ignore_foreign_warnings()
-        for module in modules:
-            warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
+        with console.show_warnings_in_a_line():
+            for module in modules:
+                warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
     assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pipeline.pair"])
 
 

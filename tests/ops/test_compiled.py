@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support.pose_problems import NOISE, map_pose_inputs, pose_depth_problem
+from support.tiny_runs import ROOM
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
@@ -1423,13 +1424,51 @@ def test_a_library_is_in_use_where_there_is_one_unless_it_is_turned_off(cache, m
 def test_without_a_library_torch_computes_and_nothing_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("DHTORCH_OPS")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with pytest.warns(ImportWarning, match=f"operators: torch, .* slower .*: {loader.COMMAND}") as heard:
         assert not dispatch.is_in_use() and loader.describe_operators() == "torch"
+    assert len(heard) == 1, "a category that Python ignores: the library prints nothing"
     monkeypatch.setenv("DHTORCH_OPS", "1")
     with pytest.raises(FileNotFoundError, match=f"no library for .*; compile it with {loader.COMMAND}"):
         plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()
+
+
+def test_how_many_times_slower_torch_is_was_measured():
+    """Whole calls of one thread in the result files that the loader names."""
+    results, ratios = Path(__file__).parents[2] / "benchmarks" / "results", []
+    for name in ("pair", "pair_avx2", "dense_speed", "dense_speed_avx2"):
+        rows = [
+            r for r in json.loads((results / f"{name}.json").read_text()) if r["threads"] == 1 and "." not in r["name"]
+        ]
+        times = {(r["name"], r["mode"]): r["ours_ms"] for r in rows}
+        ratios += [times[call, "eager"] / ms for (call, mode), ms in times.items() if mode == "compiled"]
+    assert len(ratios) == 14 and (round(min(ratios)), round(max(ratios))) == loader.TIMES_SLOWER
+
+
+#: Torch computes for the library, for a quiet command, for two commands, and for one that leaves compiled code unused.
+FIRST_USE = """
+import os, sys
+from dhtorch.cli import run
+from dhtorch.ops import dispatch, loader
+loader.INSTALLED = loader.cache()
+words = sys.argv[1:]
+print(dispatch.is_in_use(), file=sys.stderr)
+for flags, switch, is_first in ((["-q"], "", True), ([], "", True), ([], "", False), ([], "0", True)):
+    os.environ["DHTORCH_OPS"] = switch
+    loader._tried[:] = loader._tried[: not is_first]
+    print(run.main([*flags, *words]), file=sys.stderr)
+"""
+
+
+def test_a_command_prints_once_that_operators_are_not_compiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
+    monkeypatch.setenv("DHTORCH_OPS", "")
+    words = ["stream", *ROOM[:4], "data=synthetic", "method=map", "method.n=64", "max_frames=2", "output=out"]
+    command = [sys.executable, "-c", FIRST_USE, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    line = f"dhtorch: warning: operators: torch, {loader._ADVICE}"
+    assert done.stderr.splitlines() == ["False", "0", line, "0", "0", "0"]
+    assert loader.COMMAND in line and "3 to 9 times slower" in line and "C++ compiler" in line
 
 
 def copy_of(cache, folder):
