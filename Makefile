@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
-	$(BIN)/dhtorch $(ARGS)
+	$(BIN)/dhtorch run $(ARGS)
 	@echo "== The table: depth beyond the cutoff was hidden and recovered. coverage: share of samples with an answer;"
 	@echo "   median and p90: relative error of the answers; > 20 % off: share of answers that are wrong by more."
 	@echo "== Next, your own capture:  . $(BIN)/activate && dhtorch PATH     (or without activating: $(BIN)/dhtorch PATH)"

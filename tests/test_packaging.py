@@ -87,7 +87,7 @@ def test_urls_and_links_are_those_of_the_repository_that_builds(tmp_path, monkey
 
 
 def test_the_version_stands_in_one_place():
-    """Citation and changes name the version of the package."""
+    """Citation and changes, below those that are not released, name the version of the package."""
     (citation,) = re.findall(r"^version: (.*)$", (REPO / "CITATION.cff").read_text(encoding="utf-8"), re.M)
     headings = re.findall(r"^## (.*)$", (REPO / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
     assert citation == next(h for h in headings if h != "Unreleased") == dhtorch.__version__

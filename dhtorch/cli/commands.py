@@ -439,7 +439,6 @@ _PARSER_NOTES = {
         "out": OptionNote("outputs/DATE/TIME", "folder of the contact sheet"),
         "format": OptionNote("auto", "name of the format; auto = recognised from the content"),
         "max_frames": OptionNote("8", "number of frames to decode and show"),
-        "follow_links": OptionNote("false", "follow links that lead out of the capture"),
         "traceback": OptionNote("false", "show the traceback of an error"),
     },
     "fetch": {
@@ -540,7 +539,10 @@ def format_overview(exit_codes: Mapping[int, str]) -> str:
         for name, command in COMMANDS.items():
             if command.group == group:
                 lines.append(f"  {'PATH' if name == 'recover' else name:<12}{command.summary}")
-    lines += ["", "dhtorch COMMAND --help shows its options, --help-all every option, --cfg job the composed settings."]
+    lines += [
+        "",
+        "dhtorch help COMMAND or COMMAND --help: its options; --help-all: every option; --cfg job: composed settings.",
+    ]
     lines += ["-q, --quiet: print only results and errors. -v, --verbose: log inputs and steps. --version."]
     lines += textwrap.wrap(
         "Exit code: " + ", ".join(f"{k} {text}" for k, text in exit_codes.items()) + ".", _HELP_WIDTH
@@ -620,8 +622,8 @@ def to_overrides(
             names = [each.rpartition(".")[2].replace("_", "-") for each in known]
             near = suggest(option, [*(each[2:] for each in flags if each.startswith("--")), *names])
             near = near.replace("mean ", "mean --")
-            kept = ", ".join(sorted(each for each in flags if each.startswith("--")))
-            raise ValueError(f"{flag}: found an unknown option{near}, expected one listed by --help, or {kept}")
+            expected = ", ".join(["one listed by --help", *sorted(each for each in flags if each.startswith("--"))])
+            raise ValueError(f"{flag}: found an unknown option{near}, expected {expected}")
         if not sign:
             is_switch = full in known and known[full].is_switch
             is_value = bool(words) and not words[0].startswith("--")
@@ -648,14 +650,18 @@ def _with_full_name(name: str, word: str, known: Mapping[str, OptionNote]) -> st
 
 
 def to_parser_arguments(argv: Iterable[str], known: Iterable[str]) -> list[str]:
-    """``option=value`` -> ``--option value`` for commands with their own argument parser."""
+    """``option=value`` -> ``--option=value`` for commands with their own argument parser; reader options,
+    ``data.NAME=VALUE``, stay and come last."""
     out: list[str] = []
+    reader_options: list[str] = []
     for word in argv:
         option, sign, value = word.partition("=")
-        if not sign or option not in known:
+        if sign and option.startswith("data."):
+            reader_options.append(word)
+        elif not sign or option not in known:
             out.append(word)
         elif value in ("true", "false"):
             out += [f"--{option.replace('_', '-')}"] * (value == "true")
         else:
-            out += [f"--{option.replace('_', '-')}", value]
-    return out
+            out.append(f"--{option.replace('_', '-')}={value}")
+    return [*out, *reader_options]

@@ -89,19 +89,17 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
     parser.add_argument("--format", default="auto", help="name of the format (default: recognised from the content)")
     parser.add_argument("--max-frames", type=int, default=8, help="number of frames to decode and show (default: 8)")
-    parser.add_argument("--follow-links", action="store_true", help="follow links that lead out of the capture")
     parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
     options = parser.parse_intermixed_args(argv)
     if options.max_frames < 1:
         raise ValueError(f"--max-frames: found {options.max_frames}, expected at least 1")
-    is_auto = options.format == "auto"
-    captures = (
-        find_captures(options.path, options.follow_links)
-        if is_auto
-        else [_capture_of_format(options.path, options.format)]
-    )
     reader_options = _parse_reader_options(options.options)
-    captures = [replace(capture, follow_links=options.follow_links, options=reader_options) for capture in captures]
+    links = reader_options.pop("follow_links", False)
+    if not isinstance(links, bool):
+        raise ValueError(f"data.follow_links: found {links!r}, expected true or false")
+    is_auto = options.format == "auto"
+    captures = find_captures(options.path, links) if is_auto else [_capture_of_format(options.path, options.format)]
+    captures = [replace(capture, follow_links=links, options=reader_options) for capture in captures]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S-%f}"
     with open_output_folder(out, "--out"):
@@ -176,12 +174,16 @@ def _search_order(file: Path) -> tuple[object, ...]:
 def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
     """Survey of each recording, focal stack or image folder of a capture.
 
-    A folder that its reader rejects is surveyed as loose images, with the reader's message as a warning.
+    A folder that its reader rejects is surveyed as loose images, with the reader's message as a warning, unless reader
+    options are set: these may be what it rejects.
     """
     try:
-        yield from _SURVEYS_BY_KIND[capture.kind](capture, frames)
+        for survey in _SURVEYS_BY_KIND[capture.kind](capture, frames):
+            if capture.options and capture.kind != "recording":
+                survey.warn(f"not a recording: {', '.join(f'data.{name}' for name in capture.options)} not used")
+            yield survey
     except FormatError as error:
-        if not capture.path.is_dir() or not any(classify_images(capture.path)):
+        if capture.options or not capture.path.is_dir() or not any(classify_images(capture.path)):
             raise
         (survey,) = _survey_loose_pictures(capture, frames)
         survey.warnings.insert(0, f"the {capture.format} reader rejects it: {error}")
@@ -208,7 +210,7 @@ def _parse_value(text: str) -> Any:
     for kind in (int, float):
         with contextlib.suppress(ValueError):
             return kind(text)
-    return {"true": True, "false": False, "null": None}.get(text, text)
+    return {"true": True, "false": False, "null": None}.get(text.lower(), text)
 
 
 # -------------------------------------------------------------------------------------------------------------- search
@@ -354,7 +356,7 @@ def print_survey(capture: FoundCapture, survey: Survey, console: Any = None) -> 
     table.add_row("path", escape_markup(str(capture.path)))
     table.add_row("format", escape_markup(f"{survey.format} ({capture.evidence})"))
     if sensor := sensor_of_format(survey.format):
-        table.add_row("sensor", escape_markup(f"of this format, {sensor}; sensor={sensor} states its noise by range"))
+        table.add_row("sensor", f"of this format, {sensor}; dhtorch PATH --sensor {sensor} states its noise")
     for what, text in survey.facts:
         table.add_row(escape_markup(what), escape_markup(text))
     for text in survey.warnings:

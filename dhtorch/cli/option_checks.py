@@ -26,7 +26,7 @@ _PATH_OPTIONS = ("output", "out", "depth", "html", "save", "result", "root", "da
 _LIST_OPTIONS = ("data.K", "data.K_depth", "data.intrinsics", "data.camera", "data.episode", "data.distortion")
 
 #: Arguments common in other commands → the equivalent here.
-_COMMON_ALIASES = {"help": "--help", "version": "--version", "-h": "--help", "-V": "--version", "show": "view"}
+_COMMON_ALIASES = {"version": "--version", "-h": "--help", "-V": "--version", "show": "view"}
 
 #: A test of a value, and the text after "expected" in the error.
 _OptionRule = tuple[Callable[[Any], bool], str]

@@ -59,6 +59,8 @@ _CONFIGURED_COMMANDS = {
 
 #: Sub-command → the options set by its positional arguments.
 _POSITIONAL_OPTIONS = {
+    "inspect": ("path",),
+    "report": ("result",),
     **dict.fromkeys(("align", "complete", "extract", "integrate", "run", "stream", "validate"), ("data.root",)),
     "enrich": ("data.root", "out"),
     "pin": ("ref", "source"),
@@ -165,27 +167,33 @@ def _dispatch(argv: list[str]) -> int:
         warnings.simplefilter("ignore", ImportWarning)  # of operators that are not compiled: the line has it
         print(_format_version())
         return EXIT_DONE
-    if len(argv) == 1 and argv[0] in _HELP_FLAGS:
+    if argv[:1] == ["help"]:
+        argv = ["--help", *argv[1:]]
+    help_flags = _HELP_FLAGS & {*argv}
+    argv = [a for a in argv if a not in _HELP_FLAGS]
+    if not argv:
         print(commands.format_overview(EXIT_CODES))
         return EXIT_DONE
-    named = bool(argv) and argv[0] in commands.COMMANDS
-    if not named and argv:
-        _reject_missing_path(argv[0])
+    named = argv[0] in commands.COMMANDS
     name = argv[0] if named else "recover" if _is_capture(argv) else "run"
+    if not named and name == "run":
+        _reject_missing_path(argv[0])
+        words.validate_words(argv[:1], ["PATH", *commands.COMMANDS])
     typed = argv[1:] if named else argv
-    if _HELP_FLAGS & set(typed):
-        return _show_help(name, [a for a in typed if a not in _HELP_FLAGS], everything="--help-all" in argv)
+    if help_flags:
+        return _show_help(name, typed, everything="--help-all" in help_flags)
     flags = _SWEEP_FLAGS | _HYDRA_INFO_FLAGS if name == "run" else _HYDRA_INFO_FLAGS
+    flags = set() if name in _PARSED_COMMANDS else flags
     known = commands.list_options(name, config_dir())
     argv = commands.to_overrides(name, typed, known, flags, console.suggest_name)
+    if named:
+        _reject_missing_input(name, argv)
     if name in _PARSED_COMMANDS:
-        parsed = commands.to_parser_arguments(argv, known)
-        _set_threads(1)
-        return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
+        return _run_parsed(name, argv, known)
     if name == "run":
         argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
         argv = [_NO_HOLDOUT if a.partition("=")[0] == "~holdout" else a for a in argv]
-        words.validate_words(argv, ["PATH", *(each for each in commands.COMMANDS if each != "recover")])
+        words.validate_words(argv, ())
         return _run_hydra(argv)
     return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
 
@@ -202,17 +210,49 @@ def _is_capture(argv: Sequence[str]) -> bool:
 
 
 def _reject_missing_path(word: str) -> None:
-    """Raise an error for a first argument that looks like a path and does not exist."""
+    """Raise an error for a first argument that is a path and does not exist.
+
+    A path is what has a separator, begins with ``~`` or ends as a file's name does (``.r3d``), and a word that is near
+    an existing name and near no command.
+    """
     if _is_flag_or_deletion(word):
         return
     path = Path(word).expanduser()
-    looks_like_path = bool({*_SEPARATORS} & {*word}) or word.startswith("~") or bool(_FILE_END.search(word))
+    is_path = bool({*_SEPARATORS} & {*word}) or word.startswith("~") or bool(_FILE_END.search(word))
     is_option = word.startswith("hydra/") or ("=" in word and not word.startswith((*_SEPARATORS, "~", ".")))
     if is_option or path.exists():
         return
     near = console.suggest_path(path)
-    if looks_like_path or (near and not console.suggest_name(word, commands.COMMANDS)):
+    if is_path or (near and not console.suggest_name(word, commands.COMMANDS)):
         raise ValueError(f"{word}: no such file or folder{near}, expected a capture or a command (dhtorch --help)")
+
+
+def _reject_missing_input(name: str, argv: Sequence[str]) -> None:
+    """Raise an error for a positional argument that a command reads and that does not exist, before torch is loaded.
+
+    Every such argument is a path, but for ``pin``'s number of a live camera.
+    """
+    if _HYDRA_INFO_FLAGS & {a.split("=")[0] for a in argv}:
+        return
+    typed = [word for word in argv if _is_positional(word)]
+    for option, word in zip(_POSITIONAL_OPTIONS.get(name, ()), typed, strict=False):
+        path = Path(word).expanduser()
+        if option != "out" and not path.exists() and not (option == "source" and word.isdigit()):
+            expected = f"one that exists (dhtorch {name} {commands.COMMANDS[name].usage})"
+            raise ValueError(f"{word}: no such file or folder{console.suggest_path(path)}, expected {expected}")
+
+
+def _run_parsed(name: str, argv: list[str], known: Mapping[str, commands.OptionNote]) -> int:
+    """Run a command with its own argument parser."""
+    _check_flags(argv, _HELP_FLAGS)
+    unknown = [a for a in argv if not _is_positional(a) and a.partition("=")[0] not in known]
+    if unknown:
+        readers = [f"data.{option}" for option in _reader_options(config_dir())]
+        plain = [full.rpartition(".")[2] for full in known]
+        words.validate_option_names(unknown, {}, (), [*known, *readers], plain)
+    _set_threads(1)
+    parsed = commands.to_parser_arguments(argv, known)
+    return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
 
 
 def _show_help(name: str, argv: list[str], *, everything: bool) -> int:

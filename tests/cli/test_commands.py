@@ -4,11 +4,15 @@ import json
 import logging
 import re
 import shlex
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from support.tiny_runs import TINY
 
+import dhtorch
 from dhtorch import testing as writers
 from dhtorch.cli import commands, demo, process_capture, run
 from dhtorch.cli.commands import COMMANDS, list_options, resolve_option, to_overrides
@@ -85,8 +89,14 @@ def test_options_and_overrides_are_the_same(name, typed, expected):
         (["kitchn.r3d"], ["kitchn.r3d: no such file or folder"]),
         (["capturs"], ["capturs: no such file or folder (did you mean captures?)"]),
         (["inspec", "captures"], ["inspec: found an unknown argument (did you mean inspect?)"]),
-        (["run", "/nope/room"], ["/nope/room: path: found no such file or folder"]),
-        (["validate", "nope/room"], ["nope/room: path: found no such file or folder"]),
+        (["compleet", "--help"], ["compleet: found an unknown argument (did you mean complete?)"]),
+        (["help", "recovr"], ["recovr: found an unknown argument (did you mean recover?)"]),
+        (["inspect", "captures", "--cfg", "job"], ["--cfg: found an unknown option, expected one listed by --help"]),
+        (["inspect", "captures", "fow=63"], ["fow: found an unknown option (did you mean fov?)"]),
+        (["inspect", "captures", "data.fow=63"], ["data.fow: found an unknown option (did you mean data.fov?)"]),
+        (["inspect", "captures", "max_frame=3"], ["max_frame: found an unknown option (did you mean max_frames?)"]),
+        (["inspect", "captures", "-x"], ["-x: found an unknown flag"]),
+        (["report", "captures", "htlm=x.html"], ["htlm: found an unknown option (did you mean html?)"]),
     ],
 )
 def test_a_slip_has_one_line_with_the_nearest_name(command, tmp_path, argv, words):
@@ -96,6 +106,43 @@ def test_a_slip_has_one_line_with_the_nearest_name(command, tmp_path, argv, word
     assert code == 2 and not out and line.startswith("dhtorch: ")
     for word in words:
         assert word in line, line
+
+
+def test_a_path_that_does_not_exist_is_one_line_before_torch_is_loaded(tmp_path):
+    """Every positional argument that is read, of every command; `source` of pin may be a camera's number."""
+    read = {"": 1, "enrich": 1, "scale": 2, "pin": 2} | dict.fromkeys(
+        (
+            "recover",
+            "inspect",
+            "view",
+            "complete",
+            "extract",
+            "integrate",
+            "stream",
+            "validate",
+            "align",
+            "run",
+            "report",
+        ),
+        1,
+    )
+    assert {*COMMANDS} - {*read} == {"demo", "fetch"}
+    lines = [[*filter(None, [name]), *["."] * k, "no/such.r3d"] for name, n in read.items() for k in range(n)]
+    code = f"import sys\nfrom dhtorch.cli import run\nprint([run.main(words) for words in {lines}], 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.split("]") == [str([2] * len(lines))[:-1], " False\n"]
+    told = done.stderr.splitlines()
+    assert len(told) == len(lines) and all(t.startswith("dhtorch: no/such.r3d: no such file or folder") for t in told)
+
+
+@pytest.mark.parametrize("words", [[], ["help"], ["--help"], ["-q"]])
+def test_the_bare_command_prints_help(command, words):
+    assert command(*words)[:2] == (0, commands.format_overview(run.EXIT_CODES) + "\n")
+
+
+@pytest.mark.parametrize("words", [["help", "complete"], ["--help", "complete"]])
+def test_help_of_a_command_is_typed_before_it_as_well(command, words):
+    assert command(*words) == command("complete", "--help")
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("inspect", "report", "fetch")])
@@ -133,10 +180,52 @@ def test_examples_of_the_help_are_accepted(command, monkeypatch, tmp_path, name,
     monkeypatch.setattr(run, "_run_sweep", lambda *_, **__: called.append(name) or 0)
     monkeypatch.setattr(demo, "write_demo_capture", lambda _: (tmp_path / "PATH", tmp_path / "out"))
     monkeypatch.setattr(demo, "open_page", lambda *_, **__: None)
-    for folder in ("PATH", "SRC"):
-        (tmp_path / folder).mkdir()
+    for folder in (
+        "PATH",
+        "SRC",
+        "MODEL",
+        "CAPTURE",
+        "REF",
+        "SET",
+        "picture.png",
+        "RESULT",
+        "outputs/2026-01-31/12-00-00",
+    ):
+        (tmp_path / folder).mkdir(parents=True)
     code, _, err = command(*(["recover"] if name == "recover" else [name]), *shlex.split(arguments))
     assert code == 0 and called == [name], err
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "expected"),
+    [
+        ("inspect", "x --fov 63 --max-frames 3", "x --max-frames=3 data.fov=63"),
+        ("inspect", "--fov=63 x max_frames=3", "x --max-frames=3 data.fov=63"),
+        ("inspect", "fov=63 K=1,2,3,4 x", "x data.fov=63 data.K=1,2,3,4"),
+        ("inspect", "data.fov=63 x --data.fps 30 --depth-lag -1", "x data.fov=63 data.fps=30 data.depth_lag=-1"),
+        ("inspect", "x --follow-links --camera a,b", "x data.follow_links=true data.camera=a,b"),
+        ("inspect", "x format=tum --no-traceback depth_unit=mm", "x --format=tum data.depth_unit=mm"),
+        ("report", "x html=-a.html", "x --html=-a.html"),
+        ("fetch", "shared_scenes --yes --out d", "shared_scenes --yes --out=d"),
+    ],
+)
+def test_commands_with_a_parser_of_their_own_have_the_same_grammar(command, monkeypatch, name, typed, expected):
+    seen = []
+    monkeypatch.setattr(run, "importlib", SimpleNamespace(import_module=lambda _: SimpleNamespace(main=seen.append)))
+    Path("x").mkdir()
+    assert command(name, *typed.split()) == (0, "", "") and seen == [expected.split()]
+
+
+def test_every_option_that_a_message_of_inspect_names_can_be_typed(command, monkeypatch):
+    """Options of readers in the texts of all modules that read, check or show a capture."""
+    folders = [Path(dhtorch.__file__).parent / name for name in ("data", "validation", "cli/inspect.py")]
+    files = [file for folder in folders for file in (folder.rglob("*.py") if folder.is_dir() else [folder])]
+    names = {name for file in files for name in re.findall(r"\bdata\.(\w+)=", file.read_text())} - {"NAME"}
+    assert {"K", "fov", "K_depth", "depth_unit", "depth_turn", "pose_convention", "camera", "trajectory"} <= names
+    seen = []
+    monkeypatch.setattr(run, "importlib", SimpleNamespace(import_module=lambda _: SimpleNamespace(main=seen.append)))
+    typed = [f"data.{name}=1" for name in sorted(names)]
+    assert command("inspect", ".", *typed) == (0, "", "") and seen == [[".", *typed]]
 
 
 def test_everything_is_shown_on_request(command):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -418,6 +420,46 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
         capture.main([str(tmp_path), "--format", "frame_dir"])
     with pytest.raises(ValueError, match="--max-frames: found 0, expected at least 1"):
         capture.main([str(tmp_path), "--max-frames", "0"])
+
+
+def test_the_remedies_are_typed_at_the_terminal(tmp_path: Path) -> None:
+    """In a process of its own: a capture without intrinsics, with a unit and a delay of its depth."""
+    writers.write_counted_frames(tmp_path / "room", walk(3))
+    (tmp_path / "room" / "K.txt").unlink()
+    words = ["inspect", "room", "--fov", "63", "--depth-unit=mm", "data.depth_lag=1", "max_frames=2"]
+    done = subprocess.run(
+        [sys.executable, "-m", "dhtorch", *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    text = " ".join(done.stdout.split())
+    for told in ("field of view 63°", "depth unit: 1/1000 m (option depth_unit)", "depth is that of 1 frame later"):
+        assert told in text
+    assert "no intrinsics" not in text and "wrote outputs/" in text
+
+
+def test_links_are_followed_and_options_without_a_reader_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    writers.write_named_frames(tmp_path / "elsewhere", walk(2))
+    (tmp_path / "room").mkdir()
+    for each in (tmp_path / "elsewhere").iterdir():
+        (tmp_path / "room" / each.name).symlink_to(each)
+    words = ["inspect", str(tmp_path / "room"), "--out", str(tmp_path / "out")]
+    assert run.main([*words, "follow_links=true"]) == 0
+    assert "frames_dir (" in capsys.readouterr().out
+    assert run.main([*words, "data.follow_links=maybe"]) == 2
+    assert "data.follow_links: found 'maybe', expected true or false" in capsys.readouterr().err
+    (tmp_path / "loose").mkdir()
+    cv2.imwrite(str(tmp_path / "loose" / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    assert run.main(["inspect", str(tmp_path / "loose"), *words[2:], "--fov", "63"]) == 0
+    assert "not a recording: data.fov not used" in capsys.readouterr().out
+
+
+def test_a_reader_that_rejects_an_option_stops_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    writers.write_counted_frames(tmp_path / "room", walk(2))
+    words = ["inspect", str(tmp_path / "room"), "--out", str(tmp_path / "out")]
+    assert run.main([*words, "--K", "1,2,3"]) == 2
+    assert "option K: found [1.0, 2.0, 3.0], expected 4 finite numbers" in capsys.readouterr().err
 
 
 def test_command_writes_to_outputs(

@@ -346,7 +346,7 @@ def test_missing_parts_keep_the_rest_in_step(tmp_path: Path) -> None:
 def test_no_video(tmp_path: Path) -> None:
     frames = walk()
     writers.write_stray(tmp_path, frames, per_frame=True, video=False)
-    expected = "rgb.mp4: file: found no such file, expected .*images=False reads depth only"
+    expected = "rgb.mp4: file: found no such file, expected .*data.images=false reads depth only"
     with pytest.raises(FormatError, match=expected):
         data.open(tmp_path)
     recording = data.open(tmp_path, images=False, K_hw=HW)

@@ -96,7 +96,7 @@ def read(
     rows, report = _read_odometry(root / "odometry.csv")
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
-        raise FormatError(video, "file", "no such file", "the images (images=False reads depth only)")
+        raise FormatError(video, "file", "no such file", "the images (data.images=false reads depth only)")
     header = None if video is None else read_video_header(video, all_frames=True)
     hw = header.hw if header is not None else _parse_size(K_hw, root) or _DEFAULT_HW
     shots, missing = _list_shots(root, rows, poses)
