@@ -122,7 +122,7 @@ def _compute_exhibit(
 
 def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
     """The first item, or the item with the given name or number."""
-    if wanted is None:
+    if wanted is None and len(items):
         return items[0]
     names = [name(item) for item in items]
     if str(wanted) in names:

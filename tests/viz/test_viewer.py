@@ -465,6 +465,9 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
     assert code == 0 and "points.ply" in err and "page.html" in out
     data = data_of((tmp_path / "page.html").read_text())
     assert data["title"] == "synthetic_room" and not data["views"]
+    result_files.write_result(tmp_path / "old" / "result.json", result | {"data": result["data"] | {"scenes": []}})
+    code, _, err = command("view", "old", "html=page.html")
+    assert code == 2 and err.startswith("dhtorch: scene: found None, expected a number below 0")
 
 
 # ------------------------------------------------------------------------------------------- files from anywhere
