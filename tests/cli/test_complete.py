@@ -4,13 +4,10 @@ import contextlib
 import inspect
 import io
 import json
-import os
 import shutil
 import signal
 import struct
-import subprocess
 import sys
-import time
 from functools import cache
 
 import hydra
@@ -19,6 +16,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
+from support.processes import start, stop
 
 from dhtorch import MAP, data, export
 from dhtorch import testing as writers
@@ -307,22 +305,17 @@ def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_process_loses_the_frame_that_was_being_made(captures, tmp_path, stop):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_process_loses_the_frame_that_was_being_made(captures, tmp_path, how):
     out = tmp_path / "maps"
     words = ["complete", str(captures / "numbered"), f"out={out}", "planes=16", "method=map", "method.n=256"]
-    process = subprocess.Popen([sys.executable, "-m", "dhtorch", *words], stderr=subprocess.PIPE, text=True)
-    for _ in range(1200):
-        if (out / "meta" / "000000.json").is_file():
-            break
-        time.sleep(0.05)
-    os.kill(process.pid, stop)
-    err = process.communicate(timeout=60)[1]
+    code = stop(start(tmp_path, *words), lambda: list((out / "meta").glob("*.json")), 1, how)
     there = {p.stem for p in (out / "meta").glob("*.json")}
     assert 1 <= len(there) < 4
-    if stop == signal.SIGINT:
+    if how == signal.SIGINT:
+        err = (tmp_path / "err").read_text()
         lines = [line for line in err.strip().splitlines() if "depth unit assumed" not in line]
-        assert process.returncode == 130 and len(lines) == 1, err
+        assert code == 130 and len(lines) == 1, err
         assert f"{len(there)} of 4 frames" in err and "run the same command again for the rest" in err
         assert len(data.open(out)) == len(there), "a recording even so"
     before = stamps(out)
