@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,52 +13,32 @@ from dhtorch.experiments.report import ReportTable, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
-#: File, row, mode and bar of every speed that has one, in words.
+#: File, row, bar (None where none was set) and words of the table of speeds: compiled where there is an operator.
 BARS = (
-    ("frontend", "frontend_224", "eager", 1.3, "front end, 224×224, n = 1024"),
-    ("frontend", "frontend_224", "torch.compile", 0.4, "front end, 224×224, n = 1024"),
-    ("frontend", "frontend_1440", "eager", 0.08, "front end, 1440×1920"),
-    ("lk", "lk_w21_n2048", "eager", 1.3, "search there, n = 2048"),
-    ("lk", "lk_w21_n512_b8", "eager", 1.3, "search there, n = 512, B = 8"),
-    ("lk", "lk_fb_w21_n2048", "eager", 1.2, "search there and back, n = 2048"),
-    ("pnp", "pnp_n500_b16", "eager", 1.0, "pose, 500 points, B = 16"),
-    ("pnp", "pnp_n500_b1", "eager", 3.0, "pose, 500 points, B = 1"),
-    ("pnp", "pnp_n500_b1", "torch.compile", 1.0, "pose, 500 points, B = 1"),
-    ("pnp", "pnp_n500_b1", "compiled", 0.5, "pose, 500 points, B = 1"),
-    ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
-    ("pair", "pair_paper_b1", "eager", 1.3, "`paper`, whole pair, B = 1"),
-    ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),
-    ("pair", "pair_map_b1", "eager", 2.0, "`map`, whole pair, B = 1"),
-    ("pair", "pair_map_b8", "eager", 1.3, "`map`, whole pair, B = 8"),
-    ("pair", "pair_map_b8.per_far_answer", "eager", 0.2, "`map`, a far answer within 5 %, B = 8"),
-    ("pair", "every_pixel.per_far_answer", "eager", 0.2, "every pixel, a far answer within 5 %"),
-    ("pair", "every_pixel.per_far_answer", "compiled", 0.2, "every pixel, a far answer within 5 %"),
-    ("pair", "auto_reference_view", "eager", 0.7, "`auto`, a reference view, beside `WINDOW_1`"),
-    ("loader", "loader_single_640x480_workers0", "eager", 1.2, "loader with one view, 640×480, 0 workers"),
-    ("loader", "loader_single_640x480_workers0_by_batch", "eager", 1.1, "the same, a batch at once"),
-    ("loader", "loader_pair_640x480_workers0", "eager", 1.2, "loader with two views, 640×480, 0 workers"),
-    ("loader", "loader_pair_640x480_workers0_by_batch", "eager", 0.9, "the same, a batch at once"),
-    ("loader", "loader_scaling_pair_640x480", "eager", 1.05, "loader with two views, what two workers gain"),
-    ("loader", "loader_scaling_single_640x480", "eager", 1.05, "loader with one view, what two workers gain"),
-    ("frontend", "frontend_224", "compiled", 1.3, "front end, 224×224, n = 1024"),
-    ("frontend", "frontend_1440", "compiled", 0.08, "front end, 1440×1920"),
-    ("lk", "lk_w21_n2048", "compiled", 0.28, "search there, n = 2048"),
-    ("lk", "lk_w21_n512_b8", "compiled", 1.3, "search there, n = 512, B = 8"),
-    ("lk", "lk_fb_w21_n2048", "compiled", 0.28, "search there and back, n = 2048"),
-    ("pair", "pair_paper_b1", "compiled", 0.36, "`paper`, whole pair, B = 1"),
-    ("pair", "pair_paper_b8", "compiled", 0.32, "`paper`, whole pair, B = 8"),
-    ("pair", "pair_map_b1", "compiled", 0.5, "`map`, whole pair, B = 1"),
-    ("pair", "pair_map_b8", "compiled", 0.4, "`map`, whole pair, B = 8"),
-    ("pair", "auto_reference_view", "compiled", 0.4, "`auto`, a reference view, beside `WINDOW_1`"),
-    ("loader", "loader_pair_640x480_workers0", "compiled", 0.58, "loader with two views, 640×480, 0 workers"),
-    ("loader", "loader_pair_640x480_workers0_by_batch", "compiled", 0.5, "the same, a batch at once"),
-    ("loader", "loader_single_640x480_workers0", "compiled", 1.05, "loader with one view, 640×480, 0 workers"),
-    ("loader", "loader_single_640x480_workers0_by_batch", "compiled", 1.05, "the same, a batch at once"),
-    ("loader", "loader_scaling_pair_640x480", "compiled", 1.0, "loader with two views, what two workers gain"),
-    ("loader", "loader_scaling_single_640x480", "compiled", 1.0, "loader with one view, what two workers gain"),
-    ("dense_speed", "sweep_640x480", "eager", 1.5, "every pixel, one source view, 640×480"),
-    ("dense_speed", "sweep_640x480", "compiled", 0.75, "every pixel, one source view, 640×480"),
-    ("start", "start_import", "eager", 0.05, "`import dhtorch` beside `import torch`"),
+    ("frontend", "frontend_224", 1.3, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_1440", 0.08, "front end, 1440×1920"),
+    ("lk", "lk_w21_n2048", 0.28, "search there, n = 2048"),
+    ("lk", "lk_w21_n512_b8", 1.3, "search there, n = 512, B = 8"),
+    ("lk", "lk_fb_w21_n2048", 0.28, "search there and back, n = 2048"),
+    ("pnp", "pnp_n500_b1", 0.5, "pose, 500 points, B = 1"),
+    ("pnp", "pnp_n500_b16", 1.0, "pose, 500 points, B = 16"),
+    ("triangulate", "triangulate_100k", 0.03, "triangulation, 100,000 points"),
+    ("pair", "pair_paper_b1", 0.36, "`paper`, whole pair, B = 1"),
+    ("pair", "pair_paper_b8", 0.32, "`paper`, whole pair, B = 8"),
+    ("pair", "pair_map_b1", 0.5, "`map`, whole pair, B = 1"),
+    ("pair", "pair_map_b8", 0.4, "`map`, whole pair, B = 8"),
+    ("pair", "auto_reference_view", 0.4, "`auto`, a reference view, beside five views of release 1"),
+    ("dense_speed", "sweep_640x480", 0.75, "every pixel, one source view, 640×480"),
+    ("pair", "every_pixel.per_far_answer", 0.2, "every pixel, a far answer within 5 %"),
+    ("loader", "loader_pair_640x480_workers0", 0.58, "loader with two views, 640×480, 0 workers"),
+    ("loader", "loader_pair_640x480_workers0_by_batch", 0.5, "the same, a batch at once"),
+    ("loader", "loader_single_640x480_workers0", 1.05, "loader with one view, 640×480, 0 workers"),
+    ("loader", "loader_single_640x480_workers0_by_batch", 1.05, "the same, a batch at once"),
+    ("loader", "loader_scaling_pair_640x480", 1.0, "two views, what two workers gain"),
+    ("loader", "loader_scaling_single_640x480", 1.0, "one view, what two workers gain"),
+    ("validate_speed", "validate_sparse", None, "validation by sparse evidence"),
+    ("validate_speed", "validate_views", None, "validation with the images of another view"),
+    ("start", "start_import", 0.05, "`import dhtorch` beside `import torch`"),
 )
 
 #: Smallest share of a call that the table of parts shows, a ratio. Source: chosen, what rounds to one per cent.
@@ -107,29 +86,31 @@ def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
     return next((r for r in matching if r["bar"]), matching[0] if matching else None)
 
 
-def _is_like(row: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether both rows are of one processor, whichever vectors it was restricted to, and one commit's code."""
-    processors = [r["processor"].rpartition(",")[0] for r in (row, other)]
-    return processors[0] == processors[1] and row.get("git") == other.get("git")
-
-
 def bars() -> str:
-    """Each speed that has a bar, one thread, beside that bar; last its ratio without vectors wider than AVX2's, and
-    where freed memory is kept."""
+    """Speeds of one thread beside their bars: compiled where there is an operator, then in torch, and held to AVX2."""
     rows = []
-    for file, name, mode, bar, words in BARS:
-        r, *again = (_barred(f"{file}{how}", name, mode) for how in ("", *(f"_{how}" for how in AGAIN)))
-        called = words if mode == "eager" else f"{words}, {mode}"
-        if r is None:
-            rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–", "–", "–"])
-            continue
-        cells = [called, f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
-        verdict = "met" if r["ratio"] <= bar else "missed"
-        maker = f"{r['processor'].partition('(')[0].partition(',')[0]}, {r.get('git') or 'earlier code'}"
-        others = ["–" if other is None or not _is_like(other, r) else ratio(other["ratio"]) for other in again]
-        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, *others])
-    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of"]
-    head += [{"avx2": "ratio held to AVX2", "kept": "memory kept"}[how] for how in AGAIN]
+    for file, name, bar, words in BARS:
+        modes = {mode: _barred(file, name, mode) for mode in ("compiled", "eager")}
+        r = modes["compiled"] or modes["eager"]
+        assert r is not None, (file, name)
+        held = _barred(f"{file}_avx2", name, r["mode"])
+        cells = [words, f"{r['ours_ms']:.2f}", r["peer"].replace("_", " "), f"{r['peer_ms']:.2f}", ratio(r["ratio"])]
+        cells.append("–" if bar is None else f"≤ {bar:g}" + ", missed" * (r["ratio"] > bar))
+        in_torch = modes["eager"] if modes["compiled"] else None
+        cells += ["–" if other is None else ratio(other["ratio"]) for other in (in_torch, held)]
+        rows.append([*cells, errors(r), f"{r['processor'].partition('(')[0].partition(',')[0]}, {r.get('git') or '–'}"])
+    head = [
+        "",
+        "ours, ms",
+        "peer",
+        "peer, ms",
+        "ratio",
+        "bar",
+        "in torch",
+        "held to AVX2",
+        "errors, ours / peer",
+        "on, code of",
+    ]
     return text.table_to_markdown(ReportTable("", head, rows))
 
 
@@ -146,17 +127,6 @@ def stages() -> str:
             shown.append([*cells, f"{r['peer_ms']:.1f}"])
     head = ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"]
     return on("pair", text.table_to_markdown(ReportTable("", head, shown)))
-
-
-def every_row(file: str) -> str:
-    """All rows of a script, each thread count apart."""
-    rows = []
-    for r in timings(file):
-        mode = r["mode"] if r.get("warm_up_s") is None else f"{r['mode']} (warm-up {r['warm_up_s']:.0f} s)"
-        cells = [f"`{r['name']}`", mode, str(r["threads"]), f"{r['ours_ms']:.2f}", f"{r['ours_iqr']:.2f}"]
-        rows.append([*cells, r["peer"], f"{r['peer_ms']:.2f}", ratio(r["ratio"]), errors(r)])
-    head = ["row", "mode", "threads", "ours, ms", "iqr", "peer", "peer, ms", "ratio", "errors, ours / peer"]
-    return on(file, text.table_to_markdown(ReportTable("", head, rows, n_label=2)))
 
 
 def scaling() -> str:
@@ -230,4 +200,3 @@ def accelerator() -> str:
 #: Tables by marker.
 TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling, "memory": memory, "accelerator": accelerator}
 TABLES["waterfall"] = waterfall
-TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}
