@@ -12,7 +12,6 @@ import base64
 import contextlib
 import importlib
 import inspect
-import io
 import json
 import re
 import subprocess
@@ -33,7 +32,7 @@ from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
 from dhtorch import codes as code_tables  # noqa: E402
-from dhtorch.cli import commands, run  # noqa: E402
+from dhtorch.cli import run  # noqa: E402
 from dhtorch.codes import CodeTable, Gate, Hole, Source, names, words  # noqa: E402
 from dhtorch.transforms import schema  # noqa: E402
 from dhtorch.viz.plots import colours as palette  # noqa: E402
@@ -250,23 +249,6 @@ def code(dotted: str) -> str:
     return f"```python\n{text}\n```"
 
 
-def reader(name: str) -> str:
-    """What a reader says of its format, and how its options are named."""
-    wing = (
-        "dhtorch.data.readers"
-        if (REPO / "dhtorch/data/readers" / f"{name}.py").is_file()
-        else "dhtorch.experiments.focal"
-    )
-    home = "dhtorch.synthetic.recording" if name == "synthetic" else f"{wing}.{name}"
-    text = f"**`{home}`** — {module(home)}\n"
-    options = REPO / "conf" / "data" / f"{name}.yaml"
-    if not options.is_file():
-        return text
-    lines = options.read_text(encoding="utf-8").splitlines()
-    lines = [line for line in lines if line and not line.startswith(("#", "_"))]
-    return text + f"\nOptions, with their defaults (`data.NAME=VALUE`):\n\n```yaml\n{chr(10).join(lines)}\n```\n"
-
-
 def choices(group: str) -> str:
     """The choices of a settings group, with the words on top of each file."""
     rows = [f"| `{group}=` | |", "| :-- | :-- |"]
@@ -319,23 +301,15 @@ def questions() -> dict[str, dict[str, str]]:
 
 
 def experiments() -> str:
-    """One row for every experiment, then each in its own words."""
+    """One row for every experiment: its question, and what is archived."""
     answers: dict[str, list[str]] = {}
     for name, result in archived().items():
-        answer = f"{result['verdict']} on {result['data']['name']} (`{name}`)"
-        answers.setdefault(result["experiment"], []).append(answer)
-    rows, texts = ["| experiment | question | archived answers |", "| :-- | :-- | :-- |"], []
+        answers.setdefault(result["experiment"], []).append(f"{result['verdict']} (`{name}`)")
+    rows = ["| experiment | question | archived answers |", "| :-- | :-- | :-- |"]
     for name, fields in questions().items():
         question = fields["question"][0].upper() + " ".join(fields["question"][1:].split())
-        answer = "; ".join(answers.get(name, ["none"]))
-        rows.append(f"| [`{name}`](#{name}) | {question} | {answer} |")
-        idea = f"{fields['idea']}\n\n" if fields["idea"] else ""
-        texts.append(
-            f"## {name}\n\n**{question}**\n\n{idea}**{fields['when']}.** {fields['expectation']}\n\n"
-            f"**What would refute it.** {fields['refutation']}\n\nArchived answers: {answer}. "
-            f"Code: [`{fields['module']}`][{fields['module']}]."
-        )
-    return "\n".join(rows) + "\n\n" + as_markdown("\n\n".join(texts))
+        rows.append(f"| [`{name}`][{fields['module']}] | {question} | {'; '.join(answers.get(name, ['none']))} |")
+    return as_markdown("\n".join(rows))
 
 
 @cache
@@ -347,24 +321,6 @@ def archived() -> dict[str, dict[str, Any]]:
         if isinstance(result, dict) and result.get("verdict"):
             results[file.stem] = result
     return results
-
-
-def helps() -> str:
-    """Every help text of the command, as a terminal shows it."""
-    names = {"": "dhtorch"} | {name: each.words or f"dhtorch {name}" for name, each in commands.COMMANDS.items()}
-    names["recover"] = "dhtorch PATH"
-    return "\n\n".join(f"## {name}\n\n```text\n{help_of(word)}\n```" for word, name in names.items())
-
-
-def help_of(word: str) -> str:
-    """What ``dhtorch WORD --help`` prints."""
-    stdout, before = io.StringIO(), sys.argv
-    with contextlib.redirect_stdout(stdout), contextlib.suppress(SystemExit):
-        try:
-            run.main([*([word] if word else []), "--help"])
-        finally:
-            sys.argv = before
-    return stdout.getvalue().strip("\n")
 
 
 def exit_codes() -> str:
@@ -412,6 +368,5 @@ def licences() -> str:
 
 
 MAKERS: dict[str, Callable[..., str]] = {
-    f.__name__: f
-    for f in (module, code, reader, choices, codes, sample_columns, experiments, helps, exit_codes, licences, colours)
+    f.__name__: f for f in (module, code, choices, codes, sample_columns, experiments, exit_codes, licences, colours)
 }
