@@ -4,7 +4,7 @@ python benchmarks/readme.py            rewrite what stands between markers
 python benchmarks/readme.py --check    exit 1 if a page does not say what result files and code say
 
 ``<!-- name -->`` up to ``<!-- end -->`` holds a table of ``TABLES``, ``<!-- results name -->`` those of a result file
-in the paper's layout, ``<!-- client name -->`` a script of clients/, ``<!-- make: name argument -->`` what a function
+in the paper's layout, ``<!-- make: name argument -->`` what a function
 of docs/hooks.py says. The pages are committed whole. Pictures: docs/pictures.py.
 """
 
@@ -783,11 +783,6 @@ def sensitivities() -> str:
     return table(head, cells)
 
 
-def client(name: str) -> str:
-    """A script of ``clients/`` as it stands."""
-    return f"```python\n{(HERE / 'clients' / f'{name}.py').read_text(encoding='utf-8').rstrip()}\n```"
-
-
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"kornia twin": twin, "track chain": chained}
@@ -915,8 +910,6 @@ def maker(name: str) -> Callable[[], str]:
     """
     if name.startswith("results "):
         return partial(in_layout, name.removeprefix("results "))
-    if name.startswith("client "):
-        return partial(client, name.removeprefix("client "))
     if name.startswith("make: "):
         sys.path.append(str(HERE.parent / "docs"))
         import hooks
