@@ -495,41 +495,22 @@ def captures() -> str:
 
 
 def enriched() -> str:
-    """What ``dhtorch enrich`` made of each source in each format, and the loaders of others that opened it."""
-    file = RESULTS / "enrich.json"
-    if not file.is_file():
-        return "Not measured yet: `benchmarks/results/enrich.json` is not there."
-    others = [each for each in read_json(RESULTS / "clients.json") if each["opened"]]
+    """Formats that ``dhtorch enrich`` wrote of each kind of source, read back value for value, and those it refuses."""
+    records = read_json(RESULTS / "enrich.json")
+    targets = ("lerobot v3.0", "lerobot v2.1", "nerfstudio", "the source's own")
     rows = []
-    for record in sorted(json.loads(file.read_text()), key=lambda record: (record["source"], record["data"])):
-        name = f"`{record['data']}`" if record["origin"] == "real" else "written"
-        if "refused" in record:
-            why = record["refused"].rpartition("dhtorch: ")[2]  # what stands before it are warnings
-            rows.append([why, record["source"], name, record["target"], "refused", "", "", ""])
-            continue
-        weight = "" if record["mb_per_minute"] is None else f"{record['mb_per_minute']:.1f}"
-        same = f"{record['compared']:,} values" if record["source_untouched"] and record["done_again"] else "no"
-        opened = [each for each in others if (each["data"], each["target"]) == (record["data"], record["target"])]
-        loaders = list(dict.fromkeys(f"{each['loader']}{', a training step' * bool(each['step'])}" for each in opened))
-        row = [same, f"{record['s_per_frame']:.2f}", weight, "; ".join(loaders)]
-        rows.append(["; ".join(record["printed"]), record["source"], name, record["target"], *row])
-    head = [
-        "what came out",
-        "source",
-        "data",
-        "target",
-        "opened again, the same",
-        "s a frame",
-        "MB a minute",
-        "loaders",
-    ]
-    grid = text.table_to_markdown(ReportTable("", head, rows))
-    timed: dict[str, list[str]] = {}
-    for record in (record for record in json.loads(file.read_text()) if "refused" not in record):
-        timed.setdefault(f"{record['processor']}, {record['cores']} cores", []).append(record["source"])
-    processors = "; ".join(f"{name}: {', '.join(sorted(set(sources)))}" for name, sources in timed.items())
-    options = "`max_frames=3 'dense={size: 160}'`"
-    return f"{grid}\n\n{options}; processor time, beside other work. {processors}."
+    for source in sorted({record["source"] for record in records}):
+        of_source = [record for record in records if record["source"] == source]
+        cells = []
+        for target in targets:
+            of_target = [record for record in of_source if record["target"] == target]
+            written = [r for r in of_target if "refused" not in r]
+            equal = sum(bool(r["source_untouched"] and r["done_again"] and r["compared"]) for r in written)
+            cells.append(f"{equal} of {len(of_target)}" if written else "refused")
+        times = [record["s_per_frame"] for record in of_source if "refused" not in record]
+        is_real = any(record["origin"] == "real" for record in of_source)
+        rows.append([f"`{source}`", "real" if is_real else "written", *cells, f"{min(times):.2f} to {max(times):.2f}"])
+    return table(["source", "data", *targets, "s a frame"], rows)
 
 
 #: What validation is to find, in words, and its bars.
