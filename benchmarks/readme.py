@@ -677,11 +677,6 @@ def scaled() -> str:
     return table(["number", "measured", "bar"], rows)
 
 
-def questions() -> str:
-    """Every archived answer, in alphabetical order."""
-    return verdicts(list(archived_answers()))
-
-
 def caught() -> str:
     """Planted faults that a test of their module caught, of those that change an answer."""
     counts = mutants.by_module(read_json(RESULTS / "mutants.json"), packages=True)
@@ -795,7 +790,6 @@ TABLES |= {
     "captures": captures,
     "enriched": enriched,
     "loader": loader_times,
-    "questions": questions,
     "capture faults": faults_of_captures,
     "sensitivity": sensitivities,
 }

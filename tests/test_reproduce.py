@@ -36,7 +36,6 @@ def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
         ("kornia twin", {"kornia_twin"}),
         ("validate", {"validate_study", "validate_study_streams", "validate_study_unseen"}),
         ("results part_ablation", {"part_ablation"}),
-        ("questions", reproduce.OUTDATED),
         ("make: experiments", reproduce.OUTDATED),
         ("track chain", set()),
         ("pin", set()),
