@@ -112,8 +112,8 @@ class Gate(CodeTable):
     NO_BASELINE: Final = code(
         4,
         "the cameras did not translate (significantly)",
-        meaning="the camera only turned or stood still",
-        advice="moving it sideways by a tenth of the distance would help",
+        meaning="near returns show no translation of the camera",
+        advice="moving it sideways by a tenth of the distance would help; if it moved, depth may not fit the images",
         retry="try a larger pairs.gap, or pairs=auto",
     )
     BEHIND: Final = code(5, "the rays meet behind a camera", meaning="what would lie behind a camera")

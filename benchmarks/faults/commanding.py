@@ -111,12 +111,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("order_evenly", "[::-1]", ""),
         ("order_evenly", "[n // 2, 0, n - 1, *sequence]", "[0, n // 2, n - 1, *sequence]"),
         ("_choose_cutoff", "math.ceil(", "math.floor("),
-        ("_choose_cutoff", "float(np.median(returns))", "float(np.mean(returns))"),
     ],
     "cli.recover_page": [
         ("measure_recovery", "(2, 98)", "(20, 80)"),
         ("measure_recovery", "sum(n.values()) for n in counts", "sum(counts[0].values()) for n in counts"),
         ("measure_recovery", "/ len(counts)", ""),
+        ("measure_median_return", "float(np.median(returns))", "float(np.mean(returns))"),
         ("_average_no_answer_shares", "share / len(rows)", "share"),
     ],
     "cli.recover_pictures": [("_pick_evenly", "(k + 0.5)", "k")],

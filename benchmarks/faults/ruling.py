@@ -203,10 +203,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("PoseCheck.surfaces_contradict", "stated - best >= least", "True"),
         (
             "PoseCheck.surfaces_contradict",
-            "max(_MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)",
-            "_MAX_UNEXPLAINED_DISAGREEMENT",
+            "max(MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)",
+            "MAX_UNEXPLAINED_DISAGREEMENT",
         ),
-        ("PoseCheck.is_explained", "not best <= _MAX_UNEXPLAINED_DISAGREEMENT", "math.isnan(best)"),
+        ("PoseCheck.is_explained", "not best <= MAX_UNEXPLAINED_DISAGREEMENT", "math.isnan(best)"),
         ("check_poses", "if not pairs:", "if False:"),
         ("check_poses", "if scores is None:", "if False:"),
         ("depth_disagreement", "(moved[..., 2] - value).abs() / value", "(moved[..., 2] - value).abs()"),

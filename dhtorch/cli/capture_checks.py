@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dhtorch.data.foreign_files import NEEDS_DEPTH
+from dhtorch.data.foreign_files import NEEDS_DEPTH, describe_layout
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, Scenes
@@ -56,7 +56,9 @@ def require_depth(scenes: Sequence[Scene], *, remedy: str | None = None) -> None
 def describe_missing_depth(recording: Recording, n: int) -> str:
     """The message on a recording of whose ``n`` examined frames none has depth."""
     what = f"{format_count(len(recording), 'frame')}, none of the {n} examined has depth"
-    return f"{recording.name}: {what}; {NEEDS_DEPTH}"
+    lacking = None if recording.root is None else describe_layout(recording.root, is_read=True)
+    lack = f" ({lacking.what}, expected {lacking.remedy})" if lacking else ""
+    return f"{recording.name}: {what}; {NEEDS_DEPTH}{lack}"
 
 
 def _count_without_depth(recording: Recording) -> int | None:

@@ -1,7 +1,7 @@
 """``dhtorch inspect PATH``: facts, warnings and a contact sheet of a capture.
 
-Captures are searched for at the path and up to two folders below it: recordings, focal stacks, and loose images of no
-known format.
+Captures are searched for at the path and up to two folders below it: recordings, else focal stacks, else loose images
+of no known format.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import inspect
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import islice
@@ -26,11 +26,21 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.data import FormatError
 from dhtorch.data import intrinsics as intrinsics_options
-from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
+from dhtorch.data.foreign_files import (
+    NEEDS_DEPTH,
+    PHONE_EXPORTS,
+    describe_content,
+    describe_foreign_file,
+    describe_foreign_folder,
+    describe_layout,
+    list_files,
+    may_hold_depth,
+)
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
+from dhtorch.experiments.focal.image_folder import list_camera_files
 from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.geometry.sensor_noise import sensor_of_format
 from dhtorch.pipeline.picture_matching import spread_evenly
@@ -55,7 +65,6 @@ _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are 
 _CAPTURE_SUFFIXES = (  # of files that may be a whole capture
     (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
 )
-_MAX_NAMES = 10_000  # of a level of folders that are looked at for files of other tools
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -107,7 +116,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _survey_captures(captures: Iterable[FoundCapture], root: Path, n_frames: int, out: Path) -> None:
+def _survey_captures(captures: Sequence[FoundCapture], root: Path, n_frames: int, out: Path) -> None:
     """Print the content of captures and write their contact sheets into ``out``."""
     sheets: list[Path] = []
     try:
@@ -117,6 +126,8 @@ def _survey_captures(captures: Iterable[FoundCapture], root: Path, n_frames: int
                 print_survey(capture, survey)
                 sheets.append(write_contact_sheet(survey, out))
                 print(f"wrote {sheets[-1]}\n")
+        if captures[0].kind == "pictures":
+            print(f"{root}: {describe_pictures(root, captures)}")
     except KeyboardInterrupt:
         stay = f"{format_count(len(sheets), 'contact sheet')} in {out} kept; " if sheets else ""
         raise KeyboardInterrupt(f"{stay}run the same command again for the rest") from None
@@ -125,28 +136,41 @@ def _survey_captures(captures: Iterable[FoundCapture], root: Path, n_frames: int
 def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
     """Captures at ``path``, else one folder below, else two: the first level with any, folders before files.
 
+    Recordings anywhere in these levels come before focal stacks and loose images.
+
     Raises:
-        FormatError: no capture.
+        FormatError: no capture, or a folder that lacks a part of its layout.
     """
     doors.check_file_or_folder(path, "a capture")
+    levels: list[list[Path]] = []
+    for candidates in _list_levels(path):
+        levels.append(candidates)
+        if captures := _recognise_all(candidates, data.FORMATS, follow_links):
+            return captures
+        for folder in candidates:
+            if foreign := describe_layout(folder):
+                raise FormatError(folder, "content", foreign.what, foreign.remedy)
+    for candidates in levels:
+        if captures := _recognise_all(candidates, formats.STACK_FORMATS, follow_links) or _find_pictures(candidates):
+            return captures
+    content, remedy = _describe_content(path)
+    expected = f"{PHONE_EXPORTS}; or one of the {len(data.FORMATS)} formats of docs/data.md"
+    raise FormatError(path, "content", content, remedy or expected)
+
+
+def _list_levels(path: Path) -> Iterator[list[Path]]:
+    """The path, then the folders and those files one and two levels below that may be captures; folders are first."""
     level = [path]
     for _ in range(_MAX_LEVELS + 1):
+        yield level
         inside = [
             entry
             for folder in level
             if folder.is_dir()
             for entry in sorted(folder.iterdir(), key=files.natural_sort_key)
         ]
-        for candidates in (level, [entry for entry in inside if entry.suffix.lower() in _CAPTURE_SUFFIXES]):
-            captures = [
-                capture for entry in candidates if (capture := _recognise_capture(entry, follow_links)) is not None
-            ]
-            if captures:
-                return captures
+        yield [entry for entry in inside if entry.suffix.lower() in _CAPTURE_SUFFIXES]
         level = [entry for entry in inside if entry.is_dir()]
-    content, remedy = _describe_content(path)
-    expected = f"{PHONE_EXPORTS}; or one of the {len(data.FORMATS)} formats of docs/data.md"
-    raise FormatError(path, "content", content, remedy or expected)
 
 
 def _describe_content(path: Path) -> tuple[str, str | None]:
@@ -159,11 +183,10 @@ def _describe_content(path: Path) -> tuple[str, str | None]:
         return "an empty folder", None
     if foreign := describe_foreign_folder(path):
         return foreign.what, foreign.remedy
-    inside = [entry for pattern in ("*", "*/*", "*/*/*") for entry in islice(path.glob(pattern), _MAX_NAMES)]
-    for file in sorted((entry for entry in inside if entry.is_file()), key=_search_order):
+    for file in sorted(list_files(path), key=_search_order):
         if foreign := describe_foreign_file(file):
             return f"{file.relative_to(path)}: {foreign.what}", foreign.remedy
-    return "no capture here or up to two folders below", None
+    return f"no capture here or up to two folders below: {describe_content(path)}", None
 
 
 def _search_order(file: Path) -> tuple[object, ...]:
@@ -230,15 +253,47 @@ def _capture_of_format(path: Path, format: str) -> FoundCapture:
     return FoundCapture(path, "recording", format, "format= given")
 
 
-def _recognise_capture(path: Path, follow_links: bool) -> FoundCapture | None:
-    """The capture at exactly this path: recordings take precedence over focal stacks, these over loose images."""
-    with doors.restrict_links(None if follow_links else path):
-        for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
-            if evidence := reader.recognise(path):
-                return FoundCapture(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
-    if path.is_dir() and (count := sum(file.suffix.lower() in _IMAGE_SUFFIXES for file in path.iterdir())):
-        return FoundCapture(path, "pictures", "loose pictures", f"{format_count(count, 'picture')} of no known format")
-    return None
+def _recognise_all(candidates: Sequence[Path], readers: Mapping[str, Any], follow_links: bool) -> list[FoundCapture]:
+    """Captures at exactly these paths, each with the first of the formats that recognises it."""
+    kind = "stacks" if readers is formats.STACK_FORMATS else "recording"
+    captures = []
+    for path in candidates:
+        with doors.restrict_links(None if follow_links else path):
+            formats_of_path = ((name, text) for name, reader in readers.items() if (text := reader.recognise(path)))
+            captures += [FoundCapture(path, kind, *each) for each in islice(formats_of_path, 1)]
+    return captures
+
+
+def _find_pictures(candidates: Sequence[Path]) -> list[FoundCapture]:
+    """The folders among the candidates that have images."""
+    counts = {
+        folder: sum(file.suffix.lower() in _IMAGE_SUFFIXES for file in folder.iterdir())
+        for folder in candidates
+        if folder.is_dir()
+    }
+    return [
+        FoundCapture(folder, "pictures", "loose pictures", f"{format_count(count, 'picture')} of no known format")
+        for folder, count in counts.items()
+        if count
+    ]
+
+
+def describe_pictures(path: Path, captures: Sequence[FoundCapture]) -> str:
+    """Why images of no known format, found below ``path``, give no depth, and what is required instead."""
+    lists = [classify_images(capture.path) for capture in captures]
+    n_pictures, n_depths = (sum(len(each[k]) for each in lists) for k in (0, 1))
+    pictures, depths = format_count(n_pictures, "picture"), format_count(n_depths, "depth map")
+    if not n_pictures + n_depths:
+        return f"no readable image ({describe_content(path)})"
+    if n_pictures == n_depths == 1:
+        return "one frame; recovering depth requires a second view from another position"
+    if n_depths or may_hold_depth(path):
+        what = " and ".join(text for n, text in ((n_pictures, pictures), (n_depths, depths)) if n)
+        required = "a layout of docs/data.md is required, e.g. rgb/ beside depth/"
+        return f"{what} of no known format ({describe_content(path)}); {required}"
+    camera_files = list(dict.fromkeys(name for capture in captures for name in list_camera_files(capture.path)))
+    cameras = f" (cameras in {', '.join(camera_files[:3])})" if camera_files else ""
+    return f"{pictures} without depth{cameras}; {NEEDS_DEPTH}" + ("" if camera_files else f" ({PHONE_EXPORTS})")
 
 
 def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:

@@ -26,14 +26,12 @@ from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.capture_checks import describe_missing_depth, print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
-from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
+from dhtorch.cli.inspect import FoundCapture, describe_pictures, find_captures
 from dhtorch.cli.recover_pictures import CONTACT_SHEET, PREVIEW_VIDEO
-from dhtorch.codes import Source
 from dhtorch.data import FORMATS, FormatError, open_all
-from dhtorch.data.foreign_files import NEEDS_DEPTH, PHONE_EXPORTS
+from dhtorch.data.foreign_files import describe_layout
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.focal.image_folder import list_camera_files
 from dhtorch.geometry import se3
 from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
 from dhtorch.integrate.mapping import choose_voxel, file_from_world, should_mesh, surface_shape, write_surface
@@ -69,9 +67,6 @@ _COMPLETE_DEFAULTS = {
     "every": 1,
 }
 
-
-#: Frames whose returns determine the suggested cutoff. Source: origin not recorded; bounds the time of the summary.
-_CUTOFF_FRAMES = 8
 
 #: Suggested cutoff where no completed frame has a return, m. Source: origin not recorded.
 _DEFAULT_CUTOFF_M = 2.0
@@ -177,19 +172,7 @@ def find_recording_captures(path: Path, format: str = "auto") -> list[FoundCaptu
     if captures[0].kind == "stacks":
         what = f"focal stacks ({captures[0].format}) of a still camera"
         raise NothingToRecover(f"{path}: {what}; images from two positions and depth of near surfaces are required")
-    pictures, depths = classify_images(captures[0].path)
-    if len(depths) == 1:
-        raise NothingToRecover(f"{path}: one frame; recovering depth requires a second view from another position")
-    if depths:
-        what = (
-            f"{format_count(len(pictures), 'picture')} and {format_count(len(depths), 'depth map')} of no known format"
-        )
-        raise NothingToRecover(f"{path}: {what}; a layout of docs/data.md is required, e.g. rgb/ beside depth/")
-    camera_files = list_camera_files(captures[0].path)
-    what = f"{format_count(len(pictures), 'picture')} without depth"
-    what += f" (cameras in {', '.join(camera_files[:3])})" if camera_files else ""
-    remedy = "" if camera_files else f" ({PHONE_EXPORTS})"
-    raise NothingToRecover(f"{path}: {what}; {NEEDS_DEPTH}{remedy}")
+    raise NothingToRecover(f"{path}: {describe_pictures(path, captures)}")
 
 
 def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[FoundRecording], list[str]]:
@@ -227,7 +210,9 @@ def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
             open_all(capture.path, capture.format, images=False)
         except FormatError:
             raise error from None
-        raise NothingToRecover(f"{capture.path}: depth without images, which tracking requires ({error})") from None
+        foreign = describe_layout(capture.path, is_read=True)
+        lack = f": {foreign.what}, expected {foreign.remedy}" if foreign else f" ({error})"
+        raise NothingToRecover(f"{capture.path}: depth without images, which tracking requires{lack}") from None
 
 
 def order_evenly(n: int) -> list[int]:
@@ -492,13 +477,8 @@ def _format_value(value: Any) -> str:
 
 def _choose_cutoff(recovered: RecoveredFrames) -> float:
     """Median return depth over some frames, m, rounded up to two digits: half of the returns lie beyond it."""
-    task, medians = recovered.task, []
-    for i in recovered.frames[:_CUTOFF_FRAMES]:
-        maps, source = completed.read_completed_maps(task, i)
-        returns = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
-        medians += [float(np.median(returns))] if len(returns) else []
-    if not medians:
+    median = recover_page.measure_median_return(recovered.task, recovered.frames)
+    if median is None:
         return _DEFAULT_CUTOFF_M
-    median = float(np.median(medians))
     step = 10.0 ** (math.floor(math.log10(median)) - 1)
     return math.ceil(median / step - 1e-9) * step

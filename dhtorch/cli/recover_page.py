@@ -2,29 +2,49 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import gate_messages as reasons
 from dhtorch.cli.completed_folder import CompletionTask, Row
-from dhtorch.codes import SOURCES_OF_KIND, is_recovered, words
+from dhtorch.codes import SOURCES_OF_KIND, Source, is_recovered, words
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.recording import Recording
+from dhtorch.geometry import se3
 from dhtorch.runtime.console import format_count
-from dhtorch.validation.capture_check import CaptureCheck
+from dhtorch.validation.capture_check import MAX_EXPLAINED_LOSS, CaptureCheck
+from dhtorch.validation.pose_check import MAX_UNEXPLAINED_DISAGREEMENT, PoseCheck
 from dhtorch.viz.viewer.exhibit import PageOpening
 
 #: Maximum number of frames read for depth range and stated error; further frames show the same surfaces.
 _MAX_MEASURED_FRAMES = 40
+
+#: Frames whose returns determine the median return. Source: origin not recorded; bounds the time of the summary.
+_RETURN_FRAMES = 8
+
+#: Ratio of baseline to depth, and of that ratio to the angle of rotation in rad, below which stated poses have too
+#: small a baseline. Source: chosen: the parallax of a pixel's width or two at 100 px per rad; 1.5 times the ratio at
+#: which ``stages.shared_error.verify_views`` withholds a view.
+_MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN = 0.01, 0.2
 
 #: Reasons for missing answers listed on the page, the most frequent.
 _MAX_LISTED_REASONS = 3
 
 #: Smallest fraction of the pixels of a listed reason.
 _MIN_REASON_SHARE = 0.005
+
+
+class StatedMotion(NamedTuple):
+    """Motion of the stated poses from completed frames to their farthest source views, medians over frames."""
+
+    baseline: float  # m
+    turn: float  # rad
+    depth: float  # m, median return
 
 
 @dataclass(frozen=True)
@@ -38,6 +58,7 @@ class RecoveryStats:
     near: float | None = None  # m; 2 % and 98 % percentile of recovered depth; None = nothing recovered
     far: float | None = None
     error: float | None = None  # median stated sigma / depth of the recovered pixels
+    motion: StatedMotion | None = None  # where nothing was recovered and poses are stated
 
 
 def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoveryStats:
@@ -46,13 +67,39 @@ def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoverySta
     counts = [completed.count_pixels(row) for row in rows]
     fractions = {kind: float(np.mean([n[kind] / sum(n.values()) for n in counts])) for kind in SOURCES_OF_KIND}
     pixels = {kind: sum(n[kind] for n in counts) / len(counts) for kind in SOURCES_OF_KIND}
-    depth_stats: dict[str, float] = {}
-    depth, ratio = _read_recovered_pixels(task, frames)
-    if len(depth):
-        near, far = np.percentile(depth, (2, 98)).tolist()
-        depth_stats = {"near": near, "far": far, "error": float(np.median(ratio))}
     reasons = tuple(sorted(_average_no_answer_shares(rows).items(), key=lambda item: -item[1]))
-    return RecoveryStats(len(rows), fractions, pixels, reasons, **depth_stats)
+    stats = RecoveryStats(len(rows), fractions, pixels, reasons)
+    depth, ratio = _read_recovered_pixels(task, frames)
+    if not len(depth):
+        return replace(stats, motion=_measure_stated_motion(task, frames))
+    near, far = np.percentile(depth, (2, 98)).tolist()
+    return replace(stats, near=near, far=far, error=float(np.median(ratio)))
+
+
+def measure_median_return(task: CompletionTask, frames: Sequence[int]) -> float | None:
+    """Median over some frames of the median sensor depth, m; None where no completed frame has a return."""
+    medians = []
+    for i in frames[:_RETURN_FRAMES]:
+        maps, source = completed.read_completed_maps(task, i)
+        returns = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
+        medians += [float(np.median(returns))] if len(returns) else []
+    return float(np.median(medians)) if medians else None
+
+
+def _measure_stated_motion(task: CompletionTask, frames: Sequence[int]) -> StatedMotion | None:
+    """Motion of the stated poses between completed frames and their source views; None without poses or returns."""
+    poses, depth = task.recording.poses, measure_median_return(task, frames)
+    if poses is None or depth is None:
+        return None
+    position = {int(number): k for k, number in enumerate(task.recording.number)}
+    motions = []
+    for i in frames:
+        views = [position[number] for number in task.done[task.name(i)]["views"]]
+        if views:
+            baselines = (poses.t[views] - poses.t[i]).norm(dim=-1)
+            turns = se3.rotation_angle(poses.R[views].mT @ poses.R[i])
+            motions.append((float(baselines[k := int(baselines.argmax())]), float(turns[k])))
+    return StatedMotion(*np.median(motions, 0).tolist(), depth) if motions else None
 
 
 def _read_recovered_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +134,7 @@ def describe_recovery(
     sensor += f"; its {guess}." if guess else "."
     if stats.error is None:
         blamed = bool(check.findings) and stats.fractions["no_answer"] > _MIN_REASON_SHARE
-        reason = str(check.findings[0]) if blamed else _explain_silence(stats)
+        reason = str(check.findings[0]) if blamed else _explain_silence(stats, check.poses)
         also = f" Filled {filled} pixels per frame by interpolation." if filled else ""
         return [sensor, f"Nothing was recovered: {reason}.{also}"]
     amount = f"Recovered {stats.pixels['recovered']:,.0f} pixels per frame from other views, at {stats.near:.1f} m to"
@@ -129,9 +176,30 @@ def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes
     return PageOpening(shown, [*sentences, *reason_lines], picture, caption)
 
 
-def _explain_silence(stats: RecoveryStats) -> str:
+def _explain_silence(stats: RecoveryStats, poses: PoseCheck | None) -> str:
     """Most frequent reason for missing answers that has a remedy."""
     for name, share in stats.reasons:
         if share > 0.01 and (remedy := reasons.suggest_remedy(name)) is not None:
-            return remedy
+            is_stated = name == "no_baseline" and stats.motion is not None
+            return _explain_no_baseline(stats.motion, poses) if is_stated else remedy
     return "the sensor has depth almost everywhere; cutoff=2.0 hides far returns to show what other views recover"
+
+
+def _explain_no_baseline(motion: StatedMotion, poses: PoseCheck | None) -> str:
+    """Why near returns show no translation although poses are stated: what these and the check of the capture show."""
+    ratio = motion.baseline / motion.depth
+    moved = f"the stated poses move by {motion.baseline:.2g} m between views, {ratio:.1%} of the median depth"
+    if ratio < max(_MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN * motion.turn):
+        turned = f"and turn by {math.degrees(motion.turn):.0f} degrees"
+        return f"{moved}, {turned}; moving sideways by a tenth of the distance would help"
+    if poses is None:
+        return f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"
+    if poses.surfaces.stated > MAX_UNEXPLAINED_DISAGREEMENT:
+        disagreement = f"{poses.surfaces.stated:.1%} of the depth"
+        return f"{moved}, but poses and depth disagree by {disagreement}: one of them is wrong or noisy"
+    if poses.tracks is None:
+        return f"{moved}, but too few near returns were tracked; slower motion, more light and texture would help"
+    if poses.tracks.stated > MAX_EXPLAINED_LOSS:
+        loss = f"near returns miss their tracks: mean loss {poses.tracks.stated:.2f} of 1"
+        return f"{moved}, but depth and images do not fit each other ({loss}); see K, and whether one was resized"
+    return f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"

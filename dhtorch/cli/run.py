@@ -724,6 +724,7 @@ def _find_capture_below(error: BaseException, root: Any) -> str | None:
 
     Raises:
         ValueError: several, or captures of other kinds (focal stacks, images without depth).
+        FormatError: a folder below that lacks a part of its layout.
     """
     from dhtorch.cli.process_capture import find_recording_captures  # noqa: PLC0415
     from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
@@ -732,7 +733,9 @@ def _find_capture_below(error: BaseException, root: Any) -> str | None:
         return None
     try:
         captures = [str(each.path) for each in find_recording_captures(Path(str(root)))]
-    except FormatError:
+    except FormatError as lack:
+        if lack.args[0] != str(root):
+            raise
         return None
     if len(captures) > 1:
         names = ", ".join(captures[:_MAX_CAPTURES_SHOWN]) + (", …" if len(captures) > _MAX_CAPTURES_SHOWN else "")

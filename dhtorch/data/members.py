@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -136,17 +135,6 @@ def list_zip_members(archive: Path) -> dict[str, Member]:
     if len(entries) > _MAX_MEMBERS:
         raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {_MAX_MEMBERS}")
     return {entry.filename: _make_zip_member(archive, entry) for entry in entries if not entry.is_dir()}
-
-
-def get_member(members: Mapping[str, Member], name: str, root: Path) -> Member:
-    """The member called ``name``.
-
-    Raises:
-        FormatError: no such member.
-    """
-    if name not in members:
-        raise FormatError(root, name, f"no such file among {len(members)}", "a file of that name")
-    return members[name]
 
 
 def _make_zip_member(archive: Path, entry: zipfile.ZipInfo) -> ZipMember:

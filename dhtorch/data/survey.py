@@ -112,7 +112,7 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
             out.add_fact(what, f"{len(maps)}, {', '.join(sizes)}")
     if depths:
         report_depths(list(depths.values()), out)
-    out.warn("no intrinsics and no poses: nothing can be measured in it")
+    out.warn("read as loose images, without intrinsics and poses: nothing can be measured in them")
     out.tiles.extend(Tile(title, image=image) for title, image in images.items())
     out.tiles.extend(Tile(title, depth=depth) for title, depth in depths.items())
     return out

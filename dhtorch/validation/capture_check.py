@@ -55,7 +55,7 @@ _OPTIONS: Final = ValidationOptions(max_window_pairs=5)
 
 #: Mean loss of tracks under the motions of near returns up to which the latter explain them.
 #: Source: chosen on the sound captures of the shared data: 0.11 to 0.23 where motion is moderate.
-_MAX_EXPLAINED_LOSS: Final = 0.3
+MAX_EXPLAINED_LOSS: Final = 0.3
 
 #: Pictures instead of depth have a fault if undoing it in the depth raises the disagreement of surfaces under the poses
 #: by this ratio. Source: origin not recorded.
@@ -253,7 +253,7 @@ def _edge_fault(frames: Sequence[Frame], diagnosis: Diagnosis | None) -> KnownFa
         return None
     if lag := find_edge_lag(frames).lag:
         return KnownFault("time offset", f"{abs(lag)} frames {'late' if lag > 0 else 'early'}", lag=lag)
-    explained = diagnosis is not None and diagnosis.loss.get(faults.NO_FAULT.name, 1.0) < _MAX_EXPLAINED_LOSS
+    explained = diagnosis is not None and diagnosis.loss.get(faults.NO_FAULT.name, 1.0) < MAX_EXPLAINED_LOSS
     return None if explained else find_edge_fault(frames)
 
 

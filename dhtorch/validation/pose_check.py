@@ -73,7 +73,7 @@ _CONTRADICTION_LIMITS: Final = ((2.0, 0.01), (3.0, 0.003))
 
 #: Disagreement from which on poses contradict the depth although no reading is better; no reading explains more.
 #: Source: chosen on the sound captures of the shared data: at most 1.6 % between neighbouring views.
-_MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
+MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
 
 #: Disagreement under the best reading, and without poses, from which on the depth itself is doubted.
 #: Source: derived, ten times the largest between neighbouring views of the sound captures of the shared data.
@@ -179,7 +179,7 @@ class PoseCheck:
         if self.surfaces.best.is_small_factor:
             return False
         explained = any(stated >= ratio * best and stated - best >= least for ratio, least in _CONTRADICTION_LIMITS)
-        return explained or stated > max(_MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)
+        return explained or stated > max(MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)
 
     @property
     def is_depth_noise(self) -> bool:
@@ -193,7 +193,7 @@ class PoseCheck:
         if self.by_tracks:
             return True
         best = self.surfaces.best_score
-        if self.surfaces.best == PoseReading() or not best <= _MAX_UNEXPLAINED_DISAGREEMENT:
+        if self.surfaces.best == PoseReading() or not best <= MAX_UNEXPLAINED_DISAGREEMENT:
             return False
         return best < 0.5 * min(_or_infinite(self.surfaces.stated), 2 * _or_infinite(self.surfaces.without))
 

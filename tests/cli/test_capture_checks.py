@@ -15,14 +15,17 @@ from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.cli import capture_checks, inspect, process_capture, recover_page
 from dhtorch.cli.capture_checks import check_data, check_scene, print_check
+from dhtorch.codes import Source
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, Scenes
 from dhtorch.data.survey import Survey
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import se3
+from dhtorch.records import Pose
 from dhtorch.runtime import console
 from dhtorch.validation.capture_check import CaptureCheck, Finding
+from dhtorch.validation.pose_check import PoseCheck, PoseReading, ReadingScores
 
 FINDING = Finding("poses", "poses and depth contradict each other", "data.pose_convention=opengl")
 ASSUMED = "depth unit assumed: 1/1000 m (data.depth_unit= sets it)"
@@ -236,3 +239,69 @@ def test_verbosity_is_read_when_printing(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv(console._VERBOSITY_VARIABLE, "normal")
     print_check("name", CaptureCheck(recording(tmp_path), ASSUMED))
     assert f"name: {ASSUMED}" in capsys.readouterr().err
+
+
+def scores(stated):
+    return ReadingScores(stated, 0.5, PoseReading(), stated)
+
+
+#: Stated distance in m and turn in rad between neighbours, check of the poses → what is printed of the reason.
+MOTIONS = {
+    "turned": (
+        0.04,
+        0.3,
+        PoseCheck(scores(0.005), scores(0.7), 1.0, 4),
+        "and turn by 17 degrees; moving sideways by a",
+    ),
+    "still": (
+        0.0,
+        0.0,
+        None,
+        "move by 0 m between views, 0.0% of the median depth, and turn by 0 degrees; moving side",
+    ),
+    "noise": (
+        0.2,
+        0.1,
+        PoseCheck(scores(0.14), scores(0.7), 1.0, 4),
+        "but poses and depth disagree by 14.0% of the dept",
+    ),
+    "dark": (0.2, 0.1, PoseCheck(scores(0.003), None, 1.0, 4), "but too few near returns were tracked; slower motion"),
+    "resized": (
+        0.2,
+        0.1,
+        PoseCheck(scores(0.003), scores(0.38), 1.0, 4),
+        "do not fit each other (near returns miss thei",
+    ),
+    "unknown": (
+        0.2,
+        0.1,
+        PoseCheck(scores(0.003), scores(0.2), 1.0, 4),
+        "which the near returns do not show; more textu",
+    ),
+    "unchecked": (0.2, 0.1, None, "which the near returns do not show; more texture, and returns nearby, would help"),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_no_translation_is_explained_by_what_the_stated_poses_and_the_check_show(name, tmp_path, monkeypatch):
+    step, turn, check, said = MOTIONS[name]
+    xi = torch.zeros(4, 6, dtype=torch.float64)
+    xi[:, 3], xi[:, 1] = step * torch.arange(4), turn * torch.arange(4)
+    made = replace(
+        recording(tmp_path, n=4), poses=Pose(se3.exp(xi).R, xi[:, 3:]), number=torch.tensor([10, 20, 30, 40])
+    )
+    row = {"pixels": {"sensor": 80, "none": 20}, "no_answer": {"parallax": 0.01, "no_baseline": 0.19}}
+    done = {"0": {**row, "views": [20]}, "1": {**row, "views": [10, 20]}, "2": {**row, "views": []}}
+    task = SimpleNamespace(name=str, done=done, recording=made, scene=SimpleNamespace(name="box"))
+    maps = {"depth": np.full((4, 4), 2.0), "sigma": np.full((4, 4), 0.1)}, np.full((4, 4), int(Source.SENSOR))
+    monkeypatch.setattr(recover_page.completed, "read_completed_maps", lambda *_: maps)
+    stats = recover_page.measure_recovery(task, [0, 1, 2])
+    _, sentence = recover_page.describe_recovery(task, stats, (4, 4), CaptureCheck(made, poses=check))
+    moved = (
+        f"Nothing was recovered: the stated poses move by {step:g} m between views, {step / 2:.1%} of the median depth"
+    )
+    assert sentence.startswith(moved) and said in sentence and "only turned" not in sentence
+    none = replace(made, poses=None)
+    stats = recover_page.measure_recovery(SimpleNamespace(**{**vars(task), "recording": none}), [0, 1, 2])
+    _, sentence = recover_page.describe_recovery(task, stats, (4, 4), CaptureCheck(none))
+    assert stats.motion is None and "recovered: near returns show no translation of the camera; moving it" in sentence

@@ -2,10 +2,13 @@
 
 import shutil
 import sys
+import zipfile
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from support.box_scene import walk
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -60,6 +63,82 @@ def test_images_with_cameras_are_no_focal_stack(command, tmp_path):
         data.open(tmp_path / "posed")
     code, _, err = command("stream", "posed")
     assert code == 2 and "3 pictures without depth" in err
+
+
+#: Layout, files to remove, and what is printed by the command for a capture: its format, and what it lacks.
+LACKING = [
+    ("stray", "odometry.csv", "a Stray Scanner capture without odometry.csv, expected the whole folder"),
+    ("stray", "camera_matrix.csv", "a Stray Scanner capture without camera_matrix.csv, expected the whole folder"),
+    ("stray", "*.csv", "a Stray Scanner capture without odometry.csv, camera_matrix.csv, expected the whole folder"),
+    ("stray", "depth/*", "a Stray Scanner capture without depth/, expected the whole folder"),
+    ("stray", "rgb.mp4", "requires: a Stray Scanner capture without rgb.mp4, expected the whole folder of the capture"),
+    (
+        "record3d_exr",
+        "EXR_RGBD/metadata.json",
+        "EXR + RGB export of Record3D without metadata.json, expected the whole",
+    ),
+    ("record3d_exr", "EXR_RGBD/depth/*", "an EXR + RGB export of Record3D without depth/*.exr, expected the whole"),
+    ("record3d_exr", "EXR_RGBD/rgb/*", "an EXR + RGB export of Record3D without rgb/*.jpg, expected the whole"),
+    ("polycam", "keyframes/depth/*", "Polycam's raw data without depth/, expected all folders of keyframes/"),
+    ("polycam", "keyframes/*cameras/*", "Polycam's raw data without cameras/*.json, expected all folders"),
+    ("polycam", "keyframes/*images/*", "Polycam's raw data without images/, expected all folders"),
+    ("tum", "depth/*", "a TUM RGB-D sequence without depth/, expected both folders"),
+    ("tum", "rgb/*", "a TUM RGB-D sequence without rgb/, expected both folders"),
+    ("scannet", "color/*", "a ScanNet export without color/, expected the folders of SensReader"),
+    ("bop", "rgb/*", "a BOP scene without rgb/, expected the whole folder"),
+    ("colmap", "images/*", "a COLMAP model without images/, expected its images"),
+    (
+        "named_frames",
+        "*.color.png",
+        "found none complete among 2, expected frame-XXXXXX.color.{jpg,png}, .depth.png and",
+    ),
+    ("named_frames", "*.depth.png", ".pose.txt; frame 0: no depth: left out"),
+    ("nerfstudio", "images/*", "transforms.json: frames: found 2 images"),
+    ("arkitscenes", "41048190/lowres_depth/*", "an ARKitScenes capture without lowres_depth/, expected these assets"),
+]
+
+
+@pytest.mark.parametrize(("layout", "removed", "said"), LACKING)
+def test_an_export_that_lacks_files_names_its_format_and_them(command, tmp_path, layout, removed, said):
+    writers.CAPTURE_WRITERS[layout].write(tmp_path / "scan", walk(2, hw=(24, 32)))
+    paths = list((tmp_path / "scan").glob(removed))
+    assert paths
+    for path in paths:
+        path.unlink()
+        if not any(path.parent.iterdir()):
+            path.parent.rmdir()
+    code, _, err = command("scan")
+    assert code == 2 and said in err and len(err.strip().splitlines()) == 1, err
+    assert "focal stack" not in err and "no known format" not in err
+    code, out, err = command("inspect", "scan")
+    assert "focal stack" not in out + err
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"),
+    [
+        ("rgbd/", "metadata: found none among 6 files, expected a whole export of Record3D: metadata with rgbd/"),
+        ("metadata", "frames: found none, expected a whole export of Record3D: metadata with rgbd/"),
+        ("metadata rgbd/0.jpg", "frames: found frame 0: no depth: left out, expected a whole export of Record3D"),
+    ],
+)
+def test_an_r3d_file_that_lacks_files_names_them(command, tmp_path, kept, said):
+    frames = [frame.replace(conf=torch.full(frame.depth.shape, 2, dtype=torch.uint8)) for frame in walk(2, hw=(24, 32))]
+    writers.write_r3d(tmp_path / "whole.r3d", frames)
+    with zipfile.ZipFile(tmp_path / "whole.r3d") as whole, zipfile.ZipFile(tmp_path / "scan.r3d", "w") as lacking:
+        for name in whole.namelist():
+            if name.startswith(tuple(kept.split())):
+                lacking.writestr(name, whole.read(name))
+    code, _, err = command("scan.r3d")
+    assert code == 2 and said in err and "share it from the app again" in err
+
+
+def test_a_capture_below_that_lacks_files_is_named_by_every_command(command, tmp_path):
+    writers.write_stray(tmp_path / "above" / "scan", walk(2, hw=(24, 32)))
+    (tmp_path / "above" / "scan" / "odometry.csv").unlink()
+    for words in (["above"], ["inspect", "above"], ["stream", "above"], ["run", "above", "--cutoff", "2"]):
+        code, _, err = command(*words)
+        assert code == 2 and "scan: content: found a Stray Scanner capture without odometry.csv" in err, words
 
 
 @pytest.mark.parametrize("name", ["scan.usdz", "scan.obj", "scan.mp4"])

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 from support import damage_harness as hostile
 from support.box_scene import HW, pose, render
@@ -113,7 +114,7 @@ WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
     **{name: (partial(write, n=3), format, count) for name, (write, format, count) in RECORDED.items()},
     "fod500": (lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}), "fod500", 1),
     "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [random_stack(0, 10)]}), "ddff12", 1),
-    "images": (lambda root: stack_writers.write_image_folder(root, random_stack(0, 5)), "images", 1),
+    "images": (lambda root: stack_writers.write_image_folder(root / "focus_stack", random_stack(0, 5)), "images", 1),
 }
 
 
@@ -383,6 +384,101 @@ def test_many_recordings_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "2 recordings in this capture, the first 1 shown" in survey.warnings
 
 
+#: Names of images of one size that are no focal stack.
+PHOTOS = {
+    "phone": [f"IMG_{4000 + k}.JPG" for k in range(3)],
+    "screenshots": [f"Screenshot 2026-01-0{k + 1} at 10.00.00.png" for k in range(3)],
+    "burst": [f"IMG_20260101_100000_BURST{k:03d}.jpg" for k in range(4)],
+    "one": ["IMG_0001.jpg"],
+    "simulator": [f"_out/{k:08d}.png" for k in range(4)],
+    "film": [f"DCIM/100APPLE/frame_{k}.png" for k in range(4)],
+}
+
+
+def write_photos(folder: Path, names: list[str]) -> None:
+    noise = np.random.default_rng(0)
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(noise.integers(0, 256, (24, 32, 3), np.uint8)).save(folder / name)
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_images_of_one_size_are_photos_without_depth(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_photos(tmp_path / name, PHOTOS[name])
+    (found,) = capture.find_captures(tmp_path / name)
+    assert found.kind == "pictures"
+    count = f"{len(PHOTOS[name])} picture{'s' * (len(PHOTOS[name]) > 1)}"
+    said = f"{name}: {count} without depth; sensor depth of near surfaces is required for metric scale (from a phone: "
+    for words, code in (([str(tmp_path / name)], 2), (["inspect", str(tmp_path / name), "--out", str(tmp_path)], 0)):
+        assert run.main(words) == code
+        printed = "".join(capsys.readouterr())
+        assert said in printed and "focal stack" not in printed
+
+
+def test_a_focal_stack_is_named_as_one(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for name in ("focus_stack_a/9", "Focal-Sweep", "zstack/x/y", "x/focus-bracket"):
+        write_photos(tmp_path / "1" / name, ["1.png", "2.png"])
+        (found,) = capture.find_captures(tmp_path / "1" / name)
+        assert (found.kind, found.format) == ("stacks", "images") and ", named " in found.evidence
+    write_photos(tmp_path / "2", ["focus_stack_1.png", "focus_stack_2.png"])
+    assert capture.find_captures(tmp_path / "2")[0].kind == "stacks"
+    assert run.main([str(tmp_path / "2")]) == 2 and "focal stacks (images) of a still camera" in capsys.readouterr().err
+    for name in ("no_focus_stack", "focus", "stack", "focus_stack/a/b/c"):
+        write_photos(tmp_path / "3" / name, ["1.png", "2.png"])
+        assert capture.find_captures(tmp_path / "3" / name)[0].kind == "pictures", name
+        assert formats.open_stacks(tmp_path / "3" / name).format == "images", "where the caller states it"
+
+
+def test_recordings_below_come_before_loose_images(tmp_path: Path) -> None:
+    writers.write_tum(tmp_path / "a" / "scan", walk(2))
+    write_photos(tmp_path, ["screenshot.png", "a/1.jpg", "a/2.jpg"])
+    assert [found.format for found in capture.find_captures(tmp_path)] == ["tum"]
+
+
+@pytest.mark.parametrize(
+    ("images", "others", "said"),
+    [
+        (
+            ["1.jpg", "2.jpg"],
+            ["scan.png"],
+            r"2 pictures and 1 depth map of no known format (2 .jpg, scan.png); a layout",
+        ),
+        (
+            [],
+            ["depth/1.png", "depth/2.png"],
+            "2 depth maps of no known format (depth/ (2 .png)); a layout of docs/data",
+        ),
+        (["1.jpg", "2.jpg"], ["1.hdf5"], "2 pictures of no known format (1.hdf5, 2 .jpg); a layout of docs/data.md is"),
+        (["1.jpg"], ["2.png"], "one frame; recovering depth requires a second view"),
+        (["a/1.jpg", "b/2.jpg"], [], "2 pictures without depth; sensor depth"),
+        (["images/1.jpg"], ["K.txt"], "1 picture without depth (cameras in K.txt); sensor depth"),
+    ],
+)
+def test_loose_images_are_described_by_all_files(
+    images: list[str], others: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    write_photos(tmp_path / "x", images)
+    for name in others:
+        (tmp_path / "x" / name).parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith(".png"):
+            Image.fromarray(np.full((24, 32), 900, np.uint16)).save(tmp_path / "x" / name)
+        else:
+            (tmp_path / "x" / name).write_bytes(b"1 0 0")
+    assert run.main([str(tmp_path / "x")]) == 2
+    assert f"x: {said}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "format"), [("frame_000001", "frames_dir"), ("1305031102.175304", "tum")])
+def test_time_stamps_are_numbers_with_a_fraction(name: str, format: str, tmp_path: Path) -> None:
+    write_photos(tmp_path, [f"rgb/{name}.png"])
+    (tmp_path / "depth").mkdir()
+    Image.fromarray(np.full((24, 32), 900, np.uint16)).save(tmp_path / "depth" / f"{name}.png")
+    assert data.recognise(tmp_path)[0] == format
+    (tmp_path / "rgb" / f"{name}.png").unlink()
+    with pytest.raises(FormatError, match="found depth, rgb, expected"):
+        data.recognise(tmp_path)
+
+
 def test_several_captures_in_one_folder(tmp_path: Path) -> None:
     for name in ("a", "b"):
         writers.write_named_frames(tmp_path / name, walk(2))
@@ -412,9 +508,8 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "a" / "b" / "c").mkdir(parents=True)
     writers.write_named_frames(tmp_path / "a" / "b" / "c", walk(1))
     assert run.main(["inspect", str(tmp_path)]) != 0
-    assert "content: found no capture here or up to two folders below, expected from a phone: " in " ".join(
-        capsys.readouterr().err.split()
-    )
+    said = " ".join(capsys.readouterr().err.split())
+    assert "content: found no capture here or up to two folders below: a/b/c/ (" in said and "from a phone: " in said
     assert run.main(["inspect", str(tmp_path / "nowhere")]) != 0
     with pytest.raises(FormatError, match="format: found frame_dir, expected auto, record3d"):
         capture.main([str(tmp_path), "--format", "frame_dir"])

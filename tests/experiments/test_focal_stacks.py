@@ -267,17 +267,17 @@ WRITTEN = {
 def test_a_job_of_pairs_says_why_not(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = tmp_path / "sweep"
+    root = tmp_path / "focus_sweep"
     root.mkdir()
     WRITTEN[name](root)
     assert formats.recognise_stacks(root)[0] == name and formats.open_stacks(root).format == name
-    with pytest.raises(FormatError, match=r"sweep: format: found .*, expected from a phone: Record3D"):
+    with pytest.raises(FormatError, match=r"focus_sweep: format: found .*, expected from a phone: Record3D"):
         data.open(root)
     monkeypatch.chdir(tmp_path)
     assert run.main(["data=auto", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said = " ".join(capsys.readouterr().err.split())
     expected = "expected a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
-    assert f"sweep holds focal stacks ({name}), images of one view, {expected}" in said
+    assert f"focus_sweep holds focal stacks ({name}), images of one view, {expected}" in said
     assert run.main(["data=stacks", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said += " ".join(capsys.readouterr().err.split())
     assert f"data: found Stacks('{formats.open_stacks(root).name}', {name}, " in said

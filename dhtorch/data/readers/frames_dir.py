@@ -229,7 +229,8 @@ def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[st
             frames.append(ImageRow(number, files_of["color"], files_of["depth"]))
     if not frames:
         problem = f"none complete among {len(parts)}" if parts else "none"
-        raise FormatError(root, "frames", problem, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
+        expected = "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt"
+        raise FormatError(root, "frames", problem, "; ".join([expected, *report[:1]]))
     if not has_poses:
         return frames, None, [*report, "no frame-XXXXXX.pose.txt: no poses"]
     try:

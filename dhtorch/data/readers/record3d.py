@@ -27,15 +27,21 @@ from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.codecs import lzfse
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.members import Member, get_member, list_folder_members, list_zip_members
+from dhtorch.data.members import Member, list_folder_members, list_zip_members
 from dhtorch.data.readers import record3d_video
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.records import Frame
+from dhtorch.runtime.console import format_count
 
 _MEMBER_PATTERN = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
 #: Number of pixels → portrait size of a depth map: LiDAR, front camera, front camera of later devices.
 _DEPTH_SIZES = {256 * 192: (256, 192), 640 * 480: (640, 480), 960 * 720: (960, 720)}
+#: What is expected where a part of a capture is missing.
+_WHOLE_EXPORT = (
+    "a whole export of Record3D: metadata with rgbd/<i>.jpg and .depth, or metadata.json with rgb/<i>.jpg and "
+    "depth/<i>.exr; share it from the app again"
+)
 _JPEG_MARKERS = (b"\xff\xd8", b"\xff\xd9")
 
 
@@ -96,7 +102,9 @@ def read(
         members = list_folder_members(inner)
     else:
         raise FormatError(root, "path", "no such file or folder", "a Record3D capture")
-    table = get_member(members, "metadata.json" if "metadata.json" in members else "metadata", inner)
+    table = next((members[table] for table in ("metadata.json", "metadata") if table in members), None)
+    if table is None:
+        raise FormatError(inner, "metadata", f"none among {format_count(len(members), 'file')}", _WHOLE_EXPORT)
     meta = _parse_metadata(table, per_frame)
     shots, report = _list_shots(members, inner)
     shots, uncovered = _select_covered(shots, meta)
@@ -104,7 +112,7 @@ def read(
     posed = [shot for shot in shots if shot.number not in unposed]
     report += uncovered + remarks + files.format_left_out(sorted(unposed), "its pose is not usable (tracking lost)")
     if not posed:
-        raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with image, depth and metadata")
+        raise FormatError(inner, "frames", "; ".join(report) or "none", _WHOLE_EXPORT)
     load = _Load(tuple(posed), meta, *_find_sizes(posed, meta), exr_channel)
     intact = [i for i, shot in enumerate(posed) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
     report += files.format_left_out([shot.number for i, shot in enumerate(posed) if i not in set(intact)], "damaged")
@@ -263,7 +271,7 @@ def _list_shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot],
         if match := _MEMBER_PATTERN.fullmatch(name):
             parts.setdefault(int(match[1]), {})["depth" if match[2] == "exr" else match[2]] = part
     if not parts:
-        raise FormatError(root, "frames", "none", "rgbd/<i>.jpg and .depth, or rgb/<i>.jpg and depth/<i>.exr")
+        raise FormatError(root, "frames", "none", _WHOLE_EXPORT)
     required = ["jpg", "depth"] + (["conf"] if any("conf" in files_of for files_of in parts.values()) else [])
     names = {"jpg": "picture", "depth": "depth", "conf": "confidence"}
     shots, missing = [], dict[str, list[int]]()

@@ -60,6 +60,9 @@ _JOINT_TABLES = ("associations.txt", "association.txt", "associated.txt", "assoc
 _ICL_NAME_PATTERN = re.compile(r"(living_?room|office_?room).*(traj|kt)\d|traj\d_frei_png", re.IGNORECASE)
 _ICL_TRAJECTORIES = "*.gt.freiburg"
 
+#: Stem of an image that is named by its time stamp in s.
+_STAMP_PATTERN = re.compile(r"\d+\.\d+")
+
 #: Reflection of the y axis, of camera and world: from y up to y down.
 _FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
@@ -75,7 +78,7 @@ def recognise(root: Path) -> str | None:
     if not (root / "rgb").is_dir() or not (root / "depth").is_dir():
         return None
     has_listing = any((root / name).is_file() for name in ("rgb.txt", "groundtruth.txt", *_JOINT_TABLES))
-    if not (has_listing or _is_icl(root)) and any(file.stem.isdigit() for file in (root / "rgb").iterdir()):
+    if not (has_listing or _is_icl(root) or any(_STAMP_PATTERN.fullmatch(e.stem) for e in (root / "rgb").iterdir())):
         return None  # plain numbers are no stamps
     return "rgb/ and depth/ folders of time-stamped images"
 

@@ -36,7 +36,7 @@ def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = 
     root = Path(root)
     check_file_or_folder(root, "focal stacks")
     if format == "auto":
-        format = recognise_stacks(root, follow_links=follow_links)[0]
+        format = recognise_stacks(root, follow_links=follow_links, are_stacks=True)[0]
     elif format not in STACK_FORMATS:
         raise FormatError(root, "format", format, f"auto, {', '.join(STACK_FORMATS)}")
     read = STACK_FORMATS[format].read
@@ -51,8 +51,13 @@ def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = 
         return replace(read(root, **options), bounds=bounds)
 
 
-def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
+def recognise_stacks(root: str | Path, *, follow_links: bool = False, are_stacks: bool = False) -> tuple[str, str]:
     """Format of the focal stacks at ``root`` and the text of the evidence for it.
+
+    Args:
+        root, follow_links: as :func:`open_stacks`.
+        are_stacks: whether the caller states that ``root`` holds focal stacks. Images of one size are one then; else a
+            name must show it.
 
     Raises:
         FormatError: no format recognises it.
@@ -61,6 +66,8 @@ def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[s
         for name, reader in STACK_FORMATS.items():
             if evidence := reader.recognise(Path(root)):
                 return name, evidence
+        if are_stacks and (evidence := image_folder.describe_images(Path(root))):
+            return "images", evidence
     raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
 
 

@@ -16,6 +16,9 @@ from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks, parse_focu
 
 _MAX_CHECKED_IMAGES = 16  # number of images whose headers are compared when recognising a folder
 _DEPTH_FOLDERS = ("depth", "depths", "depth_maps")
+#: Beginning of the name of a stack's folder or images: ``focus_stack``, ``focal-sweep``.
+_STACK_PATTERN = re.compile(r"(foc(us|al)|z)[ _-]?(stack|sweep|bracket)", re.IGNORECASE)
+_N_NAMED_FOLDERS = 3  # the folder of the images and those above it whose names count
 _IMAGE_PATTERN = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
 
 #: Files with intrinsics or poses, which a focal stack of one still camera does not have.
@@ -30,7 +33,21 @@ _IMAGE_FOLDERS = ("images", "image", "rgb", "color", "colour", "frames")
 
 
 def recognise(root: Path) -> str | None:
-    """Text of the evidence that ``root`` is a stack of this format; None without evidence."""
+    """Text of the evidence that ``root`` is a stack of this format; None without evidence.
+
+    Photos, frames of a film and images of a simulator have one size, too: a folder is a stack only where it, one of the
+    two folders above it, or its images are named as one.
+    """
+    resolved = root.resolve()
+    names = [place.name for place in (resolved, *resolved.parents)][:_N_NAMED_FOLDERS]
+    names += sorted(file.name for file in _image_files(root))[:1]
+    named = next((name for name in names if _STACK_PATTERN.match(name)), None)
+    images = None if named is None else describe_images(root)
+    return None if images is None else f"{images}, named {named}"
+
+
+def describe_images(root: Path) -> str | None:
+    """Text on the images of ``root`` where they can be a stack of this format; None where they cannot."""
     if any((root / name).is_dir() for name in _DEPTH_FOLDERS):
         return None  # an RGB-D recording
     if list_camera_files(root):
