@@ -28,8 +28,8 @@ _MAX_MEASURED_FRAMES = 40
 _RETURN_FRAMES = 8
 
 #: Ratio of baseline to depth, and of that ratio to the angle of rotation in rad, below which stated poses have too
-#: small a baseline. Source: chosen: the parallax of a pixel's width or two at 100 px per rad; 1.5 times the ratio at
-#: which ``stages.shared_error.verify_views`` withholds a view.
+#: small a baseline. Source: chosen: a tenth of the advised ratio; above 0.12 to 0.18 of ``tum_fr1_rpy_a``, which turns,
+#: and the 0.13 below which ``stages.shared_error.verify_views`` withholds a view.
 _MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN = 0.01, 0.2
 
 #: Reasons for missing answers listed on the page, the most frequent.
@@ -99,7 +99,10 @@ def _measure_stated_motion(task: CompletionTask, frames: Sequence[int]) -> State
             baselines = (poses.t[views] - poses.t[i]).norm(dim=-1)
             turns = se3.rotation_angle(poses.R[views].mT @ poses.R[i])
             motions.append((float(baselines[k := int(baselines.argmax())]), float(turns[k])))
-    return StatedMotion(*np.median(motions, 0).tolist(), depth) if motions else None
+    if not motions:
+        return None
+    baseline, turn = np.median(motions, 0).tolist()
+    return StatedMotion(baseline, turn, depth)
 
 
 def _read_recovered_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -180,8 +183,9 @@ def _explain_silence(stats: RecoveryStats, poses: PoseCheck | None) -> str:
     """Most frequent reason for missing answers that has a remedy."""
     for name, share in stats.reasons:
         if share > 0.01 and (remedy := reasons.suggest_remedy(name)) is not None:
-            is_stated = name == "no_baseline" and stats.motion is not None
-            return _explain_no_baseline(stats.motion, poses) if is_stated else remedy
+            if name == "no_baseline" and stats.motion is not None:
+                return _explain_no_baseline(stats.motion, poses)
+            return remedy
     return "the sensor has depth almost everywhere; cutoff=2.0 hides far returns to show what other views recover"
 
 
@@ -192,8 +196,9 @@ def _explain_no_baseline(motion: StatedMotion, poses: PoseCheck | None) -> str:
     if ratio < max(_MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN * motion.turn):
         turned = f"and turn by {math.degrees(motion.turn):.0f} degrees"
         return f"{moved}, {turned}; moving sideways by a tenth of the distance would help"
+    unexplained = f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"
     if poses is None:
-        return f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"
+        return unexplained
     if poses.surfaces.stated > MAX_UNEXPLAINED_DISAGREEMENT:
         disagreement = f"{poses.surfaces.stated:.1%} of the depth"
         return f"{moved}, but poses and depth disagree by {disagreement}: one of them is wrong or noisy"
@@ -202,4 +207,4 @@ def _explain_no_baseline(motion: StatedMotion, poses: PoseCheck | None) -> str:
     if poses.tracks.stated > MAX_EXPLAINED_LOSS:
         loss = f"near returns miss their tracks: mean loss {poses.tracks.stated:.2f} of 1"
         return f"{moved}, but depth and images do not fit each other ({loss}); see K, and whether one was resized"
-    return f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"
+    return unexplained

@@ -93,7 +93,6 @@ LACKING = [
         "found none complete among 2, expected frame-XXXXXX.color.{jpg,png}, .depth.png and",
     ),
     ("named_frames", "*.depth.png", ".pose.txt; frame 0: no depth: left out"),
-    ("nerfstudio", "images/*", "transforms.json: frames: found 2 images"),
     ("arkitscenes", "41048190/lowres_depth/*", "an ARKitScenes capture without lowres_depth/, expected these assets"),
 ]
 

@@ -181,6 +181,12 @@ def write_light_field(root: Path) -> None:
     stack_writers.write_light_field(root, "train/a", 1, field, torch.ones(1, 12, 16))
 
 
+def write_focus_stack(root: Path) -> Path:
+    """A folder of images that is named as a focal stack."""
+    stack_writers.write_image_folder(root / "focus_stack", random_stack(0, 3))
+    return root / "focus_stack"
+
+
 def write_pickle(root: Path) -> Path:
     """A pickled ``.npy`` file."""
     np.save(root / "x.npy", plain_values(), allow_pickle=True)
@@ -248,7 +254,7 @@ SAMPLES: dict[str, Sample] = {
             "fod500": lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}),
             "ddff12": write_ddff12,
             "light_field": write_light_field,
-            "images": lambda root: stack_writers.write_image_folder(root, random_stack(0, 3)),
+            "images": write_focus_stack,
         }.items()
     },
     "rh20t": (write_rh20t, read_rh20t),
