@@ -14,7 +14,7 @@ from dhtorch.transforms.adapters import (
     collate_kept,
     one_thread,
 )
-from dhtorch.transforms.declared_unit import declared_depth_unit
+from dhtorch.transforms.declared_unit import declared_depth_range, declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.maps import DenseMaps
 from dhtorch.transforms.sample_access import SampleError
@@ -37,6 +37,7 @@ __all__ = [
     "SampleSpec",
     "ValidateDepth",
     "collate_kept",
+    "declared_depth_range",
     "declared_depth_unit",
     "one_thread",
     "patch_tokens",

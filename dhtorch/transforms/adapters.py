@@ -10,9 +10,11 @@ directly, before any crop: a crop would not adapt the intrinsics. kornia's conta
 
 from __future__ import annotations
 
+import copy
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,10 +23,11 @@ from torch.utils.data import Dataset, IterableDataset, default_collate
 from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.transforms import layout
 from dhtorch.transforms.collate import collate_shared, pack_shared
-from dhtorch.transforms.declared_unit import declared_depth_unit
+from dhtorch.transforms.declared_unit import declared_depth_range, declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
-from dhtorch.transforms.sample_spec import AUTO_UNIT
+from dhtorch.transforms.sample_spec import AUTO_UNIT, NO_LIMITS
+from dhtorch.transforms.validate_depth import ValidateDepth
 
 #: Number of items, first ones and neighbours each, that are tried for the shapes of one that cannot be loaded.
 _MAX_ITEMS_TRIED = 16
@@ -54,7 +57,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     Args:
         dataset: ``dataset[i]`` is a dict.
         transform: for single samples; ``by_batch`` makes one for batches of it. With ``depth_unit="auto"`` the unit is
-            that which the data set declares, see :func:`dhtorch.transforms.declared_depth_unit`.
+            that which the data set declares, see :func:`dhtorch.transforms.declared_depth_unit`; its depth's range
+            (:func:`dhtorch.transforms.declared_depth_range`) limits ``depth_range`` in any case.
         gap: items from the source view to the reference view; None = the sample itself holds both.
         episode_key: key of the episode number; None = there is one episode.
         by_batch: items stay unchanged, and :meth:`collate`, then required as the loader's ``collate_fn``, transforms
@@ -80,7 +84,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     ) -> None:
         if gap is not None and (gap < 1 or transform.views.other_image is None):
             raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
-        transform = _resolve_unit(transform, dataset)
+        transform = _as_declared(transform, dataset)
         if by_batch:
             transform = transform.with_options(batched=True)
         elif transform.batched:
@@ -222,7 +226,8 @@ class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
         self.dataset = dataset
-        self.transform = _resolve_unit(transform, dataset) if isinstance(transform, ExtendDepth) else transform
+        reads_depth = isinstance(transform, ExtendDepth | ValidateDepth)
+        self.transform = _as_declared(transform, dataset) if reads_depth else transform
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for sample in self.dataset:
@@ -296,12 +301,20 @@ def one_thread(worker: int = 0) -> None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which do not exist in a forked worker
 
 
-def _resolve_unit(transform: ExtendDepth, dataset: Any) -> ExtendDepth:
-    """Transform with ``depth_unit="auto"`` -> the same with the unit that the data set declares."""
+def _as_declared(transform: Any, dataset: Any) -> Any:
+    """Transform -> the same with the range of depth that the data set declares, and its unit for ``"auto"``."""
     views = transform.views
-    if views.depth_unit != AUTO_UNIT:
+    low, high = declared_depth_range(dataset, views.depth)
+    changes: dict[str, Any] = {}
+    if views.depth_unit == AUTO_UNIT:
+        changes["depth_unit"] = declared_depth_unit(dataset, views.depth)
+    if (low, high) != NO_LIMITS:
+        changes["depth_range"] = max(low, views.depth_range[0]), min(high, views.depth_range[1])
+    if not changes:
         return transform
-    return transform.with_options(depth_unit=declared_depth_unit(dataset, views.depth))
+    other = copy.copy(transform)
+    other.views = replace(views, **changes)
+    return other
 
 
 def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:

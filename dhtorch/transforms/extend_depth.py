@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -130,19 +129,16 @@ class ExtendDepth(torch.nn.Module):
         keys = ", ".join(map(str, self.views.keys()))
         return f"ExtendDepth({self.method!r}{dense}; reads {keys}; adds {self.prefix}*)"
 
-    def with_options(self, *, depth_unit: str | float | None = None, batched: bool | None = None) -> ExtendDepth:
-        """The same transform with another unit or for batches; networks and counts of problems are shared.
+    def with_options(self, *, batched: bool) -> ExtendDepth:
+        """The same transform for batches or for single samples; networks and counts of problems are shared.
 
         Raises:
             ValueError: ``batched`` other than that stated when the transform was made.
         """
+        if self._batched_option not in (None, batched):
+            raise ValueError(f"batched is {self._batched_option}, expected {batched}, or no statement")
         other = copy.copy(self)
-        if depth_unit is not None:
-            other.views = replace(self.views, depth_unit=depth_unit)
-        if batched is not None:
-            if self._batched_option not in (None, batched):
-                raise ValueError(f"batched is {self._batched_option}, expected {batched}, or no statement")
-            other.batched, other._batched_option = batched, batched
+        other.batched, other._batched_option = batched, batched
         return other
 
     @standard_numerics

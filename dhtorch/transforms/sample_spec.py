@@ -74,6 +74,9 @@ class SampleViews(NamedTuple):
 #: Value of ``depth_unit``: the unit that the data set declares.
 AUTO_UNIT = "auto"
 
+#: Value of ``depth_range``, m: every depth is a return.
+NO_LIMITS = (0.0, math.inf)
+
 #: Start of the names of LeRobot's pictures.
 _LEROBOT_PICTURES = "observation.images."
 
@@ -121,7 +124,7 @@ class SampleSpec:
     refine: bool = False  # use the pose only as the starting point of the pose estimation
     layout: str | None = None  # "hwc" or "chw"; None = the axis of size 1 or 3 is C, an error if both fit
     intrinsics_hw: tuple[int, int] | None = None  # image size of the intrinsics; None = size of the image
-    depth_range: tuple[float, float] = (0.0, float("inf"))  # m, depths outside are no returns (a codec's "no return")
+    depth_range: tuple[float, float] = NO_LIMITS  # m, depths outside are no returns (a codec's "no return")
     max_depth: float = 100.0  # m, a larger median depth means a wrong unit
     min_depth: float = 0.01  # m, a smaller median depth means a wrong unit
     min_focal: float = 0.05  # smaller focal lengths, as a fraction of the longer image side, are of another unit

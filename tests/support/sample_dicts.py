@@ -1,6 +1,7 @@
 """A small data set of the synthetic room as sample dicts; at module level, so that spawned workers can import it."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -11,6 +12,22 @@ from dhtorch.synthetic.recording import SyntheticRoom
 GAP = 6
 SIDE = 112
 NEAR = 2.0
+
+#: Info of a depth feature, as LeRobot 0.6.1 writes it into meta/info.json for a video with its default options.
+DEPTH_VIDEO = {
+    "is_depth_map": True, "depth_unit": "mm", "video.height": SIDE, "video.width": SIDE, "video.codec": "hevc",
+    "video.pix_fmt": "gray12le", "video.fps": 30, "video.channels": 1, "has_audio": False, "video.g": 2,
+    "video.crf": 30, "video.preset": None, "video.fast_decode": 0, "video.video_backend": "pyav",
+    "video.extra_options": {"x265-params": "lossless=1"}, "video.depth_min": 0.01, "video.depth_max": 10.0,
+    "video.shift": 3.5, "video.use_log": True,
+}  # fmt: skip
+
+
+def depth_video(key, output="mm", **info):
+    """What a LeRobotDataset declares of its depth video ``key``, handed out in ``output``; ``info`` replaces entries."""
+    about = {**DEPTH_VIDEO, **{f"video.{name}": value for name, value in info.items()}}
+    feature = {"dtype": "video", "shape": (SIDE, SIDE, 1), "names": ["height", "width", "channels"], "info": about}
+    return {"meta": SimpleNamespace(features={key: feature}, depth_keys=[key]), "depth_output_unit": output}
 
 
 @cache

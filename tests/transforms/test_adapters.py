@@ -6,12 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support.sample_dicts import GAP, SIDE, Frames, Stream, frames
+from support.sample_dicts import DEPTH_VIDEO, GAP, SIDE, Frames, Stream, depth_video, frames
 from support.stub_samples import sample as tiny_sample
 from support.stub_samples import tiny
 from torch.utils.data import DataLoader, default_collate
 
 from dhtorch.codes import Source
+from dhtorch.data.readers.lerobot_depth import dequantise_depth
+from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.transforms import (
     AddedCollate,
     ExtendDepth,
@@ -24,6 +26,7 @@ from dhtorch.transforms import (
     ValidateDepth,
     adapters,
     collate_kept,
+    declared_depth_range,
     one_thread,
 )
 
@@ -44,14 +47,16 @@ def equal(a, b):
 
 
 class LeRobot(torch.utils.data.Dataset):
-    """Items as LeRobotDataset hands them out: dotted keys, float CHW in [0, 1], depth (1, H, W) float mm in which *no
-    return* comes back as the codec's lower limit, frames along time and ``_is_pad`` where ``delta_timestamps`` asks."""
+    """Items as LeRobotDataset hands them out: dotted keys, float CHW in [0, 1], depth (1, H, W) float mm of a video in
+    which *no return* comes back as the codec's lower or upper limit, frames along time and ``_is_pad`` where
+    ``delta_timestamps`` asks."""
 
     fps = 30
     camera, depth = "observation.images.wrist", "observation.images.wrist_depth"
 
     def __init__(self, items, deltas=None):
         self.items, self.deltas = items, deltas
+        self.__dict__ |= depth_video(self.depth)
 
     def __len__(self):
         return len(self.items)
@@ -64,7 +69,7 @@ class LeRobot(torch.utils.data.Dataset):
         mm = torch.from_numpy(item["depth"].astype(np.float32))[None]
         out = {
             self.camera: self.picture(i),
-            self.depth: torch.where(mm > 0, mm, 10.0),
+            self.depth: torch.where(mm > 0, mm, torch.where(torch.arange(SIDE) < SIDE // 2, 10.0, 10000.0)),
             "observation.state": torch.zeros(7),
             "action": torch.ones(7),
             "timestamp": torch.tensor(i / self.fps),
@@ -85,19 +90,19 @@ class LeRobot(torch.utils.data.Dataset):
 
 def wrist(items, **options):
     K = items[0]["intrinsics"].astype(float)
-    keys = {"image": LeRobot.camera, "depth": LeRobot.depth, "depth_unit": "mm", "depth_range": (0.0102, 9.99)}
+    keys = {"image": LeRobot.camera, "depth": LeRobot.depth, "depth_unit": "auto"}
     keys["intrinsics"] = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]  # the format has no place for them
     return ExtendDepth(**{**keys, "index_key": "index", "n": N, "prefix": "dhtorch.", **options})
 
 
 def test_lerobot_frames_along_time(items):
     dataset = ExtendedDataset(LeRobot(items, deltas=[-GAP, 0]), wrist(items))
-    assert len(dataset) == 12 and dataset.fps == 30 and not hasattr(dataset, "meta")
+    assert len(dataset) == 12 and dataset.fps == 30 and not hasattr(dataset, "hf_dataset")
     out = dataset[GAP]
     assert out["task"] == "look around" and out[LeRobot.camera].shape == (2, 3, SIDE, SIDE)
     assert out["dhtorch.pose_ok"] and (out["dhtorch.source"] == Source.RECOVERED).any()
     plain = ExtendDepth(depth_unit="mm", other_image="before", index_key="index", n=N)
-    assert equal(out, plain({**items[GAP], "before": items[0]["image"]})), "the lost zeros are no returns"
+    assert equal(out, plain({**items[GAP], "before": items[0]["image"]})), "both ends of the codes are no returns"
     padded = [dataset[i] for i in (0, 3, 9, 11)]
     assert [int(p["dhtorch.problem"]) for p in padded] == [SampleProblem.NO_SECOND_VIEW] * 4
     assert not any((p["dhtorch.source"] == Source.RECOVERED).any() for p in padded)
@@ -411,6 +416,84 @@ def test_the_unit_is_that_which_the_data_set_declares(dtype, info, output, unit)
     assert transform.views.depth_unit == "auto", "the transform itself is unchanged"
 
 
+#: Codec of a depth video and unit -> what LeRobot 0.6.1 decodes codes 0 to 3, 2047 and 4092 to 4095 to, and how many of
+#: them at either end are no return: two, and those of the same millimetre.
+DECODED = [
+    ({}, "mm", [10.0, 11.0, 12.0, 13.0, 3383.0, 9987.0, 9991.0, 9996.0, 10000.0], 2),
+    (
+        *({}, "m"),
+        [0.0100002289, 0.0111546516, 0.0123102665, 0.0134656429, 3.38254452, 9.98668194, 9.99112034, 9.99555969, 10.0],
+        2,
+    ),
+    ({"use_log": False}, "mm", [10.0, 12.0, 15.0, 17.0, 5004.0, 9993.0, 9995.0, 9998.0, 10000.0], 2),
+    (
+        *({"use_log": False}, "m"),
+        [0.00999999978, 0.0124395601, 0.0148791205, 0.0173186809, 5.00378036, 9.9926815, 9.995121, 9.9975605, 10.0],
+        2,
+    ),
+    (
+        *({"depth_min": 0.5, "depth_max": 60.0}, "m"),
+        [0.5, 0.502701759, 0.505404949, 0.508110046, 12.4319992, 59.8715134, 59.9143181, 59.9571495, 60.0],
+        2,
+    ),
+    (
+        *({"depth_min": 0.3, "depth_max": 0.8}, "m"),
+        [0.300000191, 0.30011487, 0.300229311, 0.300344467, 0.542215824, 0.799610615, 0.799740791, 0.799870491, 0.8],
+        2,
+    ),
+    ({"depth_min": 0.3, "depth_max": 0.8}, "mm", [300.0, 300.0, 300.0, 300.0, 542.0, 800.0, 800.0, 800.0, 800.0], 4),
+]
+
+
+@pytest.mark.parametrize(("codec", "unit", "decoded", "n_ends"), DECODED)
+@pytest.mark.parametrize("stated", ["auto", "unit"])
+def test_both_ends_of_a_depth_video_are_no_returns(codec, unit, decoded, n_ends, stated):
+    data = SimpleNamespace(**depth_video("d", unit, **codec))
+    transform = ExtendDepth(image="i", depth="d", depth_unit="auto" if stated == "auto" else unit)
+    views = ExtendedDataset(data, transform).transform.views
+    kinds = [torch.float32, torch.float64] + [torch.uint16, torch.int32] * (unit == "mm")
+    for kind in kinds:
+        metres = views.metres([torch.tensor([[decoded]]).to(kind)])[0].flatten()
+        assert metres.bool().tolist() == [False] * n_ends + [True] * (9 - 2 * n_ends) + [False] * n_ends
+    assert transform.views.depth_range == (0.0, np.inf) and views.depth_unit == unit
+    codes = LeRobotFeature("d", "video", (1, 4096, 1), data.meta.features["d"]["info"])
+    returns = dequantise_depth(codes, np.arange(4096, dtype=np.uint16), "info.json")
+    low, high = declared_depth_range(data, "d")
+    assert np.array_equal((returns > low) & (returns <= high), returns > 0) == (n_ends == 2), "the reader's own limits"
+
+
+def test_limits_that_are_stated_remain_within_those_of_a_depth_video():
+    data = SimpleNamespace(**depth_video("d"))
+    for stated, expected in (((0.3, 20.0), (0.3, 9.99334)), ((0.0, 4.0), (0.0117324, 4.0))):
+        transform = ExtendDepth(image="i", depth="d", depth_unit="mm", depth_range=stated)
+        for wrapper in (ExtendedDataset, ExtendedStream):
+            assert wrapper(data, transform).transform.views.depth_range == pytest.approx(expected, abs=1e-6)
+    with pytest.raises(ValueError, match=r"info.json: d depth_min, depth_max, shift: found \[5.0, 4.0, 3.5\]"):
+        declared_depth_range(SimpleNamespace(**depth_video("d", depth_min=5.0, depth_max=4.0)), "d")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "output", "is_marked"), [("image", "mm", True), ("video", None, True), ("video", "mm", False)]
+)
+def test_depth_that_is_no_decoded_video_has_no_limits(dtype, output, is_marked):
+    data = Declared(dtype, DEPTH_VIDEO, output)
+    data.meta.depth_keys *= is_marked
+    assert declared_depth_range(data, "d") == declared_depth_range(data, "e") == (0.0, np.inf)
+    transform = ExtendDepth(image="i", depth="d", depth_unit="mm")
+    assert ExtendedDataset(data, transform).transform is transform and declared_depth_range([], "d") == (0.0, np.inf)
+
+
+def test_a_validation_reads_the_ends_of_a_depth_video_as_no_returns(items):
+    options = {"image": LeRobot.camera, "depth": LeRobot.depth, "judging": {"size": 56, "views": False}, "n": N}
+    judge = ValidateDepth(**options, depth_unit="auto", intrinsics=items[0]["intrinsics"].astype(float))
+    out = next(iter(ExtendedStream(LeRobot(items), judge)))
+    told = LeRobot(items)[0]
+    told[LeRobot.depth] = torch.from_numpy(items[0]["depth"].astype(np.float32))[None]
+    plain = ValidateDepth(**options, depth_unit="mm", intrinsics=items[0]["intrinsics"].astype(float))(told)
+    assert out.keys() == plain.keys() and (items[0]["depth"] == 0).mean() > 0.1
+    assert all(torch.equal(out[key], plain[key]) for key in plain if key.startswith("observation.dh_"))
+
+
 def test_without_a_data_set_no_unit_is_declared():
     transform = ExtendDepth(image="i", depth="d", depth_unit="auto")
     with pytest.raises(ValueError, match="found list, expected a LeRobot data set"):
@@ -432,7 +515,7 @@ def test_the_prefix_that_lerobots_processors_keep():
 
 @pytest.mark.parametrize("posed", [False, True])
 def test_a_gap_adds_the_earlier_picture_its_mark_and_its_pose(posed, monkeypatch):
-    monkeypatch.setattr(adapters, "_resolve_unit", lambda transform, _: transform)
+    monkeypatch.setattr(adapters, "_as_declared", lambda transform, _: transform)
     views = SimpleNamespace(image="image", other_image="earlier", pose="T", other_pose="T_earlier" if posed else None)
     items = [{"image": f"picture {k}", "T": f"pose {k}", "episode": k // 3} for k in range(5)]
     views.keys = lambda: ("image",)

@@ -2,7 +2,8 @@
 
 A depth video holds 12-bit codes, by default logarithmic, that span ``depth_min`` to ``depth_max``. The encoder clips
 *no return* to the nearest distance and everything too far to the farthest; the two codes at either end are therefore
-read as no return. A video of more bits without a stated range holds steps of a unit, as images and arrays do.
+read as no return (:func:`find_return_range`), also where LeRobot has decoded the video. A video of more bits without a
+stated range holds steps of a unit, as images and arrays do.
 """
 
 from __future__ import annotations
@@ -150,7 +151,28 @@ def dequantise_depth(feature: LeRobotFeature, codes: np.ndarray, file: Path) -> 
     """
     if codes.dtype != np.uint16 or codes.max(initial=0) >= _N_DEPTH_CODES:
         raise FormatError(file, f"{feature.key} pixels", f"{codes.dtype} up to {codes.max(initial=0)}", "12-bit codes")
-    return _metres_by_code(feature, file)[codes]
+    table = _metres_by_code(feature, file)
+    low, high = find_return_range(feature, file)
+    return np.where((table > low) & (table <= high), table, 0.0)[codes]
+
+
+def find_return_range(feature: LeRobotFeature, file: Path, rounding: float = 0.0) -> tuple[float, float]:
+    """Lower and upper limit in m of the returns of a depth video: the two codes at either end lie outside.
+
+    Args:
+        feature: its info states the range of the codes.
+        file: named in errors.
+        rounding: largest error in m of the decoded depth; returns that near an end code are left out as well.
+
+    Raises:
+        FormatError: an invalid range in the feature's info.
+    """
+    table = _metres_by_code(feature, file)
+    low, high = (
+        table[1] + max(rounding, (table[2] - table[1]) / 2),
+        table[-2] - max(rounding, (table[-2] - table[-3]) / 2),
+    )
+    return float(low), float(high)
 
 
 def decode_depth_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.ndarray:
@@ -165,7 +187,7 @@ def decode_depth_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.nda
 
 
 def _metres_by_code(feature: LeRobotFeature, file: Path) -> np.ndarray:
-    """Table code → m, 0 for the two codes at either end, to which the encoder clips values out of range."""
+    """Table code → m, from ``depth_min`` to ``depth_max``."""
     numbers = []
     for key, default in _DEFAULT_DEPTH_RANGE.items():
         value = feature.info.get(f"video.{key}", feature.info.get(key, default))
@@ -176,8 +198,5 @@ def _metres_by_code(feature: LeRobotFeature, file: Path) -> np.ndarray:
         raise FormatError(file, f"{feature.key} depth_min, depth_max, shift", numbers, "a range of metres")
     fraction = np.arange(_N_DEPTH_CODES) / (_N_DEPTH_CODES - 1)
     if log:
-        table = np.exp((1 - fraction) * np.log(low + shift) + fraction * np.log(high + shift)) - shift
-    else:
-        table = low + fraction * (high - low)
-    table[:2] = table[-2:] = 0
-    return table
+        return np.exp((1 - fraction) * np.log(low + shift) + fraction * np.log(high + shift)) - shift
+    return low + fraction * (high - low)

@@ -8,6 +8,7 @@ already, from a data loader, passes unchanged.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from dhtorch import CameraPin, ExtendDepth
 from dhtorch.functional import geometry_image, point_cloud
 from dhtorch.geometry.camera import resize, to_matrix
 from dhtorch.records import Camera, Frame
-from dhtorch.transforms import SampleError, SampleSpec, ValidateDepth, declared_depth_unit
+from dhtorch.transforms import SampleError, SampleSpec, ValidateDepth, declared_depth_range, declared_depth_unit
 from lerobot_camera_dhtorch.window import FrameWindow
 
 #: Description of what passes through a pipeline, as :meth:`ProcessorStep.transform_features` takes it.
@@ -33,6 +34,9 @@ Shapes = dict[str, tuple[FeatureType, tuple[int, ...]]]
 
 #: Start of added keys: LeRobot's processors keep what starts with ``observation.``.
 PREFIX = "observation.dh_"
+
+#: Depth units of LeRobot's data sets -> units per metre.
+UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 #: LeRobot's step before which pictures and depth have their own units.
 NORMALIZER = "normalizer_processor"
@@ -120,7 +124,7 @@ class _WindowStep(_DepthStep):
 
     @classmethod
     def from_dataset(cls, dataset: Any, image: str, depth: str | None = None, **more: Any) -> Any:
-        """A step for a LeRobot data set, with unit and intrinsics as its metadata and columns state them.
+        """A step for a LeRobot data set, with unit, range and intrinsics as its metadata and columns state them.
 
         Intrinsics that differ between frames stay a key, which a robot's observation then needs, too.
 
@@ -141,8 +145,9 @@ class _WindowStep(_DepthStep):
             if "min" in stats and np.array_equal(stats["min"], stats["max"]):  # one camera: a robot need not state it
                 K = dataset[0][K].tolist()
         stated = {"distortion": lens.get("dist"), "depth_intrinsics": np.ravel(lens.get("K_depth", ())).tolist()}
-        options = {**{name: x for name, x in stated.items() if x}, **(more.pop("options", None) or {})}
-        unit = declared_depth_unit(dataset, depth)
+        declared = _declared_depth(dataset, depth)
+        unit = declared.pop("depth_unit")
+        options = {**{name: x for name, x in stated.items() if x}, **declared, **(more.pop("options", None) or {})}
         return cls(image=image, depth=depth, intrinsics=K, depth_unit=unit, options=options, **more)
 
     def _process(self, transition: Any) -> Any:
@@ -200,7 +205,7 @@ class _WindowStep(_DepthStep):
         unit = self.views.depth_unit
         if depth.is_floating_point() or unit == self.camera.depth_unit:
             return depth
-        return self.camera.metres([depth])[0] * (1000.0 if unit == "mm" else 1.0)
+        return self.camera.metres([depth])[0] * UNITS_PER_METRE[unit]
 
     def _finish(self, transition: Any, added: dict[str, Tensor]) -> Any:
         """Transition and added keys -> the result."""
@@ -328,19 +333,35 @@ class MaskSilenceStep(_DepthStep):
     Args:
         keys: of depth maps and their standard deviations.
         stage: ``before`` or ``after`` the normaliser.
+        limits: key -> lower and upper limit of depth, in the unit of the map; maps of whole numbers, as a camera gives
+            them, have none. :meth:`from_dataset` reads those of depth videos, which have no 0, from the metadata.
     """
 
-    def __init__(self, *, keys: Sequence[str], stage: str) -> None:
+    def __init__(self, *, keys: Sequence[str], stage: str, limits: Mapping[str, Sequence[float]] | None = None) -> None:
         if stage not in ("before", "after"):
             raise ValueError(f"stage is {stage!r}, expected before or after")
-        super().__init__(keys=list(keys), stage=stage)
+        super().__init__(keys=list(keys), stage=stage, limits=dict(limits or {}))
+
+    @classmethod
+    def from_dataset(cls, dataset: Any, keys: Sequence[str], stage: str) -> MaskSilenceStep:
+        """A step for a LeRobot data set, with the limits that its metadata state."""
+        limits = {}
+        for key in keys:
+            if math.isfinite((metres := declared_depth_range(dataset, key))[1]):
+                scale = UNITS_PER_METRE[declared_depth_unit(dataset, key)]
+                limits[key] = [scale * x for x in metres]
+        return cls(keys=keys, stage=stage, limits=limits)
 
     def _process(self, transition: Any) -> Any:
         observation = transition[TransitionKey.OBSERVATION]
         for key in self.config["keys"]:
             mask = f"{key}_known"
             if self.config["stage"] == "before":
-                observation[mask] = observation[key] > 0
+                x = observation[key]
+                observation[mask] = x > 0
+                if key in self.config["limits"] and x.is_floating_point():
+                    low, high = self.config["limits"][key]
+                    observation[mask] = (x > low) & (x <= high)
             elif mask not in observation:
                 raise SampleError(f"{mask}: found no such key, expected dhtorch_mask_silence before the normaliser")
             else:
@@ -352,14 +373,52 @@ class MaskSilenceStep(_DepthStep):
         return {f"{key}_known": (FeatureType.STATE, tuple(known[key].shape)) for key in keys}
 
 
+class _MapStep(_DepthStep):
+    """Base of steps that encode a depth map for policies.
+
+    Args:
+        depth: key of the map (B, H, W) or (B, 1, H, W).
+        depth_unit: of the map, ``m`` or ``mm``; None = that of ``dhtorch_extend_depth``, m, for maps of it.
+        depth_range: lower and upper limit in m of depth, outside of which there is none; None = there are no limits.
+
+    Raises:
+        ValueError: no unit, or another one.
+    """
+
+    def __init__(
+        self, *, depth: str, depth_unit: str | None = None, depth_range: Sequence[float] | None = None, **more: Any
+    ) -> None:
+        unit = "m" if depth_unit is None and depth.startswith(PREFIX) else depth_unit
+        if unit not in UNITS_PER_METRE:
+            expected = "m or mm; from_dataset(dataset, depth) reads it from a data set"
+            raise ValueError(f"{depth}: depth_unit is {unit!r}, expected {expected}")
+        super().__init__(depth=depth, depth_unit=unit, depth_range=depth_range, **more)
+        self.views = SampleSpec(depth=depth, depth_unit=unit, depth_range=depth_range or (0.0, math.inf))
+
+    @classmethod
+    def from_dataset(cls, dataset: Any, depth: str, **more: Any) -> Any:
+        """A step for depth of a LeRobot data set, in the unit and with the limits that its metadata state.
+
+        Raises:
+            ValueError: the data set states no unit.
+        """
+        return cls(depth=depth, **_declared_depth(dataset, depth), **more)
+
+    def _depth(self, observation: Mapping[str, Any]) -> Tensor:
+        """Depth map (B, H, W) m, 0 = none."""
+        return self.views.metres([_map(observation[self.views.depth])])[0]
+
+
 @ProcessorStepRegistry.register("dhtorch_geometry_image")
-class GeometryImageStep(_DepthStep):
+class GeometryImageStep(_MapStep):
     """Adds a picture that encodes depth, sigma and source: :func:`dhtorch.functional.geometry_image`.
 
     Args:
-        depth, sigma, source: keys of the maps (B, H, W) or (B, 1, H, W), m; those of ``dhtorch_extend_depth`` with
-            ``dense``.
         to: key of the picture (B, 3, H, W), in [0, 1] as LeRobot's pictures.
+        depth, sigma, source: keys of the maps (B, H, W) or (B, 1, H, W), sigma in the unit of depth; those of
+            ``dhtorch_extend_depth`` with ``dense``.
+        more: ``depth_unit`` and ``depth_range`` of maps that are not of ``dhtorch_extend_depth``, which
+            :meth:`from_dataset` reads from the metadata of a data set.
     """
 
     def __init__(
@@ -369,13 +428,15 @@ class GeometryImageStep(_DepthStep):
         depth: str = f"{PREFIX}depth_map",
         sigma: str = f"{PREFIX}sigma_map",
         source: str = f"{PREFIX}source_map",
+        **more: Any,
     ) -> None:
-        super().__init__(to=to, depth=depth, sigma=sigma, source=source)
+        super().__init__(to=to, depth=depth, sigma=sigma, source=source, **more)
 
     def _process(self, transition: Any) -> Any:
         observation = transition[TransitionKey.OBSERVATION]
-        maps = (_map(observation[self.config[name]]) for name in ("depth", "sigma", "source"))
-        observation[self.config["to"]] = geometry_image(*maps).float() / 255
+        sigma, source = (_map(observation[self.config[name]]) for name in ("sigma", "source"))
+        sigma = sigma / UNITS_PER_METRE[self.views.depth_unit]
+        observation[self.config["to"]] = geometry_image(self._depth(observation), sigma, source).float() / 255
         return transition
 
     def _added(self, known: Mapping[str, PolicyFeature]) -> Shapes:
@@ -384,15 +445,17 @@ class GeometryImageStep(_DepthStep):
 
 
 @ProcessorStepRegistry.register("dhtorch_point_cloud")
-class PointCloudStep(_DepthStep):
+class PointCloudStep(_MapStep):
     """Adds ``n`` points of a depth map in the camera's axes, m (:func:`dhtorch.functional.point_cloud`).
 
     Args:
         image: key of the picture, whose size the intrinsics belong to.
         intrinsics: as those of ``dhtorch_extend_depth``.
-        depth: key of the map (B, H, W) or (B, 1, H, W), m, over the field of view of the picture.
+        depth: key of the map (B, H, W) or (B, 1, H, W), over the field of view of the picture.
         to: key of the points (B, n, 3).
         n: number of points.
+        more: ``depth_unit`` and ``depth_range`` of maps that are not of ``dhtorch_extend_depth``, which
+            :meth:`from_dataset` reads from the metadata of a data set.
     """
 
     def __init__(
@@ -403,13 +466,14 @@ class PointCloudStep(_DepthStep):
         depth: str = f"{PREFIX}depth_map",
         to: str = "observation.points",
         n: int = 1024,
+        **more: Any,
     ) -> None:
         intrinsics = intrinsics if isinstance(intrinsics, str) else [float(x) for x in intrinsics]
-        super().__init__(image=image, intrinsics=intrinsics, depth=depth, to=to, n=n)
+        super().__init__(image=image, intrinsics=intrinsics, depth=depth, to=to, n=n, **more)
 
     def _process(self, transition: Any) -> Any:
         observation = transition[TransitionKey.OBSERVATION]
-        depth, stated = _map(observation[self.config["depth"]]), self.config["intrinsics"]
+        depth, stated = self._depth(observation), self.config["intrinsics"]
         numbers = torch.as_tensor(observation[stated] if isinstance(stated, str) else stated).to(depth)
         rows = numbers.reshape(-1, 4 if numbers.shape[-1] == 4 else 9)
         f, c = (rows[:, :2], rows[:, 2:]) if rows.shape[1] == 4 else (rows[:, 0:5:4], rows[:, 2:6:3])
@@ -449,10 +513,27 @@ class CameraPinStep(_DepthStep):
         super().__init__(image=image, intrinsics=numbers, max_px=max_px, false_alarm_rate=false_alarm_rate)
         self.pin: CameraPin | None = None
 
-    def set_reference(self, image: Tensor, depth: Tensor | None = None) -> None:
-        """The view of the camera in its place: picture (C, H, W) or (1, C, H, W), and depth in m where there is one."""
+    def set_reference(
+        self,
+        image: Tensor,
+        depth: Tensor | None = None,
+        *,
+        depth_unit: str = "m",
+        depth_range: Sequence[float] = (0.0, math.inf),
+    ) -> None:
+        """The view of the camera in its place.
+
+        Args:
+            image: picture (C, H, W) or (1, C, H, W).
+            depth: map (h, w), (1, h, w) or (1, 1, h, w) of the same view, 0 = none; None = there is no map.
+            depth_unit: of the map; that of a LeRobot data set is its
+                :func:`dhtorch.transforms.declared_depth_unit`.
+            depth_range: lower and upper limit in m of depth, outside of which there is none; those of a LeRobot data
+                set are its :func:`dhtorch.transforms.declared_depth_range`.
+        """
         image = image[None] if image.dim() == 3 else image
-        depth = torch.zeros_like(image[:, 0], dtype=torch.float32) if depth is None else _map(depth.float())
+        depth = torch.zeros_like(image[:, 0], dtype=torch.float32) if depth is None else _map(depth)
+        depth = SampleSpec(depth_unit=depth_unit, depth_range=depth_range).metres([depth])[0]
         numbers = torch.tensor([self.config["intrinsics"]])
         frame = Frame(image.cpu(), depth.reshape(1, *depth.shape[-2:]).cpu(), Camera(numbers[:, :2], numbers[:, 2:]))
         self.pin = CameraPin(frame, false_alarm_rate=self.config["false_alarm_rate"])
@@ -491,3 +572,10 @@ def _map(x: Any) -> Tensor:
     """Maps (B, H, W) or (B, 1, H, W) -> (B, H, W)."""
     x = torch.as_tensor(x)
     return x.squeeze(1) if x.ndim == 4 else x
+
+
+def _declared_depth(dataset: Any, key: str) -> dict[str, Any]:
+    """Key of depth in a LeRobot data set -> its ``depth_unit``, and ``depth_range`` where it has limits."""
+    low, high = declared_depth_range(dataset, key)
+    limits = {"depth_range": [low, high]} if math.isfinite(high) else {}
+    return {"depth_unit": declared_depth_unit(dataset, key), **limits}

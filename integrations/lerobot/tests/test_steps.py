@@ -1,12 +1,15 @@
 """The processor steps, in LeRobot's own pipelines, on a set that ``dhtorch enrich`` wrote (``DHTORCH_LEROBOT_SET``)."""
 
+import inspect
 import os
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from fake_hardware import HW, RANGE_M, FakeDepthCamera, FakeDepthCameraConfig, intrinsics
 from lerobot.cameras import CameraConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PipelineFeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -27,7 +30,12 @@ from lerobot_camera_dhtorch import (  # noqa: E402
 from dhtorch import ExtendDepth  # noqa: E402
 from dhtorch.codes import Source  # noqa: E402
 from dhtorch.functional import decode_geometry_image  # noqa: E402
-from dhtorch.transforms import ExtendedDataset, SampleError  # noqa: E402
+from dhtorch.transforms import (  # noqa: E402
+    ExtendedDataset,
+    SampleError,
+    declared_depth_range,
+    declared_depth_unit,
+)
 
 IMAGE = "observation.images.left"
 DEPTH = f"{IMAGE}_depth"
@@ -268,3 +276,90 @@ def test_a_moved_camera_is_seen_and_the_reference_is_saved(tmp_path):
     strict.set_reference(batch(0)[IMAGE], batch(0)[DEPTH])
     with pytest.raises(SampleError, match="camera moved by at least"):
         PolicyProcessorPipeline(steps=[strict])(batch(4))
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Folder of a set whose depth LeRobot writes as video, with default options, and the depth (n, H, W) in m; 0 = none.
+
+    The farthest returns of the last rows are beyond the range of the codes."""
+    if "depth_output_unit" not in inspect.signature(LeRobotDataset).parameters:
+        pytest.skip("LeRobot knows no depth before 0.6")
+    root, truth = tmp_path_factory.mktemp("video") / "set", []
+    picture = {"dtype": "video", "names": ["height", "width", "channels"]}
+    features = {IMAGE: {**picture, "shape": (*HW, 3)}, "action": {"dtype": "float32", "shape": (2,), "names": None}}
+    features[DEPTH] = {**picture, "shape": (*HW, 1), "info": {"is_depth_map": True}}
+    written = LeRobotDataset.create("local/video", fps=30, root=root, features=features, use_videos=True)
+    camera = FakeDepthCamera(FakeDepthCameraConfig())
+    for _ in range(5):
+        image, depth = camera.read(), camera.read_depth()
+        depth[-8:] = 12_000
+        written.add_frame({IMAGE: image, DEPTH: depth, "action": np.zeros(2, np.float32), "task": "look"})
+        truth.append(np.where(depth < 10_000, depth, 0)[..., 0] / 1000)
+    written.save_episode()
+    written.finalize()
+    return root, torch.from_numpy(np.stack(truth))
+
+
+def opened(video, unit, **more):
+    return LeRobotDataset("local/video", root=video[0], video_backend="pyav", depth_output_unit=unit, **more)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_steps_read_the_ends_of_a_depth_video_as_no_returns(unit, video, tmp_path):
+    data, truth = opened(video, unit), video[1][4]
+    rows = [{key: x[None] for key, x in data[i].items() if key.startswith("observation.")} for i in range(5)]
+    known, ends = truth > 0, [] if unit == "m" else [10.0, 10_000.0]
+    assert 0.1 < known.double().mean() < 0.9 and set(ends) <= set(rows[4][DEPTH].unique().tolist())
+    maps = {"sigma": "observation.sigma", "source": "observation.source"}
+    extra = {"observation.sigma": 0.01 * rows[4][DEPTH], "observation.source": torch.ones(1, *HW)}
+    steps = [
+        ExtendDepthStep.from_dataset(data, IMAGE, DEPTH, intrinsics=intrinsics(), gap=2, options=QUICK),
+        GeometryImageStep.from_dataset(data, DEPTH, to="observation.images.geometry", **maps),
+        PointCloudStep.from_dataset(data, DEPTH, image=IMAGE, intrinsics=intrinsics(), n=4000),
+        MaskSilenceStep.from_dataset(data, [DEPTH, "observation.dh_depth_map"], "before"),
+        MaskSilenceStep.from_dataset(data, [DEPTH], "after"),
+    ]
+    pipeline = reloaded(PolicyProcessorPipeline(steps=steps, name="policy_preprocessor"), tmp_path)
+    for row in rows:
+        out = pipeline({**row, **extra})
+    source, z = out["observation.dh_source"], out["observation.dh_depth"]
+    near = truth[known].min()
+    assert (source == Source.RECOVERED).sum() > 50 and z[source == Source.SENSOR].min() > near - 0.01
+    assert z[source == Source.SENSOR].max() < RANGE_M + 0.1
+    assert torch.equal(out[f"{DEPTH}_known"][0, 0], known) and not out[DEPTH][0, 0][~known].any()
+    swept = out["observation.dh_depth_map"] > 0
+    assert torch.equal(out["observation.dh_depth_map_known"], swept) and swept.any()
+    image = decode_geometry_image(out["observation.images.geometry"])
+    assert torch.equal(image.depth[0] > 0, known) and (image.depth[0] / truth - 1)[known].abs().max() < 0.02
+    assert ((image.sigma[0] / image.depth[0] - 0.01)[known].abs() < 0.002).all()
+    points = out["observation.points"][0]
+    assert near - 0.002 < points[:, 2].min() and points[:, 2].max() < truth.max() + 0.002
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_a_reference_and_a_validation_take_depth_of_a_video(unit, video):
+    window = opened(video, unit, delta_timestamps={key: [-2 / 30, 0.0] for key in (IMAGE, DEPTH)})
+    step = ValidateDepthStep.from_dataset(window, IMAGE, DEPTH, intrinsics=intrinsics(), options={"n": 512})
+    sample = torch.utils.data.default_collate([window[4]])
+    out = PolicyProcessorPipeline(steps=[step])(sample)
+    assert out["observation.dh_depth_ok"].tolist() == [True] and out["observation.dh_wrong"][0, 0] < 0.02
+    pin = CameraPinStep(image=IMAGE, intrinsics=intrinsics())
+    stated = {"depth_unit": declared_depth_unit(window, DEPTH), "depth_range": declared_depth_range(window, DEPTH)}
+    pin.set_reference(sample[IMAGE][0, -1], sample[DEPTH][0, -1], **stated)
+    assert (pin.pin.frame.depth[0] - video[1][4]).abs().max() < 0.004
+
+
+def test_whole_millimetres_of_a_robot_have_no_ends_and_other_depth_needs_a_unit(video):
+    data = opened(video, "mm")
+    whole = {DEPTH: (1000 * video[1][:1, None]).round().to(torch.int32)}
+    step = MaskSilenceStep.from_dataset(data, [DEPTH], "before")
+    known = PolicyProcessorPipeline(steps=[step])(whole)[f"{DEPTH}_known"]
+    assert torch.equal(known[0, 0], video[1][0] > 0)
+    with pytest.raises(ValueError, match=f"{DEPTH}: depth_unit is None, expected m or mm"):
+        PointCloudStep(image=IMAGE, intrinsics=intrinsics(), depth=DEPTH)
+    with pytest.raises(ValueError, match="depth_unit is 'auto'"):
+        GeometryImageStep(to="observation.images.geometry", depth_unit="auto")
+    step = PointCloudStep.from_dataset(data, DEPTH, image=IMAGE, intrinsics=intrinsics(), n=8)
+    row = {IMAGE: data[0][IMAGE][None], DEPTH: torch.full((1, 1, *HW), 10.0)}
+    assert not PolicyProcessorPipeline(steps=[step])(row)["observation.points"].any()

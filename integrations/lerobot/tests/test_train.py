@@ -43,7 +43,9 @@ def save_policy(folder):
     )
     masks = [MaskSilenceStep(keys=[DEPTH], stage=stage) for stage in ("before", "after")]
     insert_steps(
-        before, before=[GeometryImageStep(to="observation.images.geometry", **MAPS), masks[0]], after=masks[1:]
+        before,
+        before=[GeometryImageStep(to="observation.images.geometry", depth_unit="m", **MAPS), masks[0]],
+        after=masks[1:],
     )
     for part in (ACTPolicy(config), before, after):
         part.save_pretrained(folder)
