@@ -16,6 +16,7 @@ TESTS: dict[str, list[str]] = {
     "data.clocks": ["tests/data/test_clocks.py"],
     "data.convert": [*READERS, "tests/data/test_orientation.py"],
     "data.corrections": ["tests/data/test_corrections.py"],
+    "data.depth_codes": [*LEROBOT, "tests/transforms/test_adapters.py"],
     "data.depth_maps": ["tests/data/test_depth_maps.py"],
     "data.intrinsics": FOLDERS,
     "data.io.decode": [*CODECS, *READERS],
@@ -66,7 +67,6 @@ TESTS: dict[str, list[str]] = {
     ],
     "data.readers.image_table": [*FOLDERS, *READERS],
     "data.readers.lerobot": LEROBOT,
-    "data.readers.lerobot_depth": LEROBOT,
     "data.readers.lerobot_meta": LEROBOT,
     "data.readers.lerobot_rows": LEROBOT,
     "data.readers.nerfstudio": POSED,
@@ -114,6 +114,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("cv_from_gl", "c2w @ _GL_FROM_CV", "_GL_FROM_CV @ c2w"),
         ("splat_depth", "1.1 * _window_min", "0.5 * _window_min"),
         ("splat_depth", "v * w + u", "u * h + v"),
+    ],
+    "data.depth_codes": [
+        ("metres_by_code", "np.log(high + shift)) - shift", "np.log(high + shift))"),
+        ("metres_by_code", "(N_CODES - 1)", "N_CODES"),
+        ("metres_by_code", "low + fraction * (high - low)", "fraction * (high - low)"),
+        ("find_return_range", "max(rounding, (metres[2] - low) / 2)", "(metres[2] - low) / 2"),
+        ("find_return_range", "max(rounding, (high - metres[-3]) / 2)", "(high - metres[-3]) / 2"),
+        ("find_return_range", "float(metres[1])", "float(metres[0])"),
     ],
     "data.pairs": [
         ("by_time", "step / 2 if tolerance is None", "step / 20 if tolerance is None"),
@@ -255,11 +263,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_Load._depth", "(self.step_m or 1.0)", "1.0"),
         ("_Load._within", "depth <= min(high, 1e6)", "depth < min(high, 1e6) / 2"),
         ("_Load._within", "depth >= low", "depth > 0"),
-    ],
-    "data.readers.lerobot_depth": [
-        ("_metres_by_code", "np.log(high + shift)) - shift", "np.log(high + shift))"),
-        ("_metres_by_code", "(_N_DEPTH_CODES - 1)", "_N_DEPTH_CODES"),
-        ("_metres_by_code", "low + fraction * (high - low)", "fraction * (high - low)"),
     ],
     "data.readers.lerobot_meta": [
         ("LeRobotEpisodes.__getitem__", "number // meta.chunks_size", "number % meta.chunks_size"),

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dhtorch.data.readers.lerobot_depth import find_return_range
-from dhtorch.data.readers.lerobot_meta import LeRobotFeature
+from dhtorch.data.depth_codes import find_return_range
 from dhtorch.transforms.sample_spec import NO_LIMITS
 
 #: Form of a depth feature that LeRobot decodes; the others are arrays of numbers.
@@ -61,8 +60,7 @@ def declared_depth_range(dataset: Any, key: str) -> tuple[float, float]:
     unit = _output_unit(dataset, key) if feature is not None and feature["dtype"] == "video" else None
     if feature is None or unit is None:
         return NO_LIMITS
-    codes = LeRobotFeature(key, "video", tuple(feature.get("shape") or ()), dict(feature.get("info") or {}))
-    return find_return_range(codes, Path("meta") / "info.json", _ROUNDING_M[unit])
+    return find_return_range(feature.get("info") or {}, key, Path("meta") / "info.json", _ROUNDING_M[unit])
 
 
 def _output_unit(dataset: Any, key: str) -> str | None:

@@ -98,7 +98,7 @@ class SampleSpec:
         ValueError: an invalid option.
     """
 
-    # "m", "mm", or metres per unit; required. "auto" = what the data set declares that ExtendedDataset wraps.
+    # "m", "mm", or metres per unit; required. "auto" = what the data set declares in ExtendedDataset or ExtendedStream.
     depth_unit: str | float = ""
     image: str = "image"  # key of the reference view's image
     depth: str = "depth"  # key of the reference view's depth map

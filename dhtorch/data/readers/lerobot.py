@@ -6,7 +6,7 @@ frame; its image is the video frame at the episode's start plus the row's time s
 
 The format has no place for intrinsics and poses. K comes from option ``K``, else from a feature, else from the side-car
 ``meta/intrinsics.json``: ``{camera key: {"K": 3×3, "dist": […], "K_depth": 3×3}}``, the last two as needed. Depth
-videos have no code for *no return*, see :mod:`dhtorch.data.readers.lerobot_depth`.
+videos have no code for *no return*, see :mod:`dhtorch.data.depth_codes`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Depth of LeRobot data sets: the depth feature of a camera, and its images or video codes -> metres.
 
-A depth video holds 12-bit codes, by default logarithmic, that span ``depth_min`` to ``depth_max``. The encoder clips
-*no return* to the nearest distance and everything too far to the farthest; the two codes at either end are therefore
-read as no return (:func:`find_return_range`), also where LeRobot has decoded the video. A video of more bits without a
-stated range holds steps of a unit, as images and arrays do.
+A depth video holds 12-bit codes (:mod:`dhtorch.data.depth_codes`). A video of more bits without a stated range holds
+steps of a unit, as images and arrays do.
 """
 
 from __future__ import annotations
@@ -17,6 +15,7 @@ import numpy as np
 
 from dhtorch.data.codecs.tiff import decode_tiff, decode_tiff_header
 from dhtorch.data.codecs.video import read_video_header
+from dhtorch.data.depth_codes import CODE_BITS, DEFAULT_RANGE, N_CODES, find_return_range, metres_by_code
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotFeature, LeRobotMeta, select_colour_keys
@@ -24,9 +23,6 @@ from dhtorch.data.readers.lerobot_rows import read_encoded_image
 from dhtorch.data.units import UNIT_METRES, DepthUnit
 
 _GREY = "gray"  # start of FFmpeg's names of pixel formats with one channel
-_CODE_BITS = 12  # of LeRobot's depth videos
-_N_DEPTH_CODES = 2**_CODE_BITS
-_DEFAULT_DEPTH_RANGE = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # m
 
 
 class _PixelType(NamedTuple):
@@ -76,7 +72,7 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
         FormatError: an unknown unit, or a damaged image or video.
     """
     if feature.dtype == "video":
-        if _has_stated_range(feature) or _read_pixel_type(meta, feature, episode, row).bits <= _CODE_BITS:
+        if _has_stated_range(feature) or _read_pixel_type(meta, feature, episode, row).bits <= CODE_BITS:
             return None
         return DepthUnit(UNIT_METRES["mm"])
     entry = "unit" if feature.dtype != "image" and "depth_unit" not in feature.info else "depth_unit"
@@ -91,7 +87,7 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
 
 
 def _has_stated_range(feature: LeRobotFeature) -> bool:
-    return any(f"{prefix}{name}" in feature.info for name in _DEFAULT_DEPTH_RANGE for prefix in ("", "video."))
+    return any(f"{prefix}{name}" in feature.info for name in DEFAULT_RANGE for prefix in ("", "video."))
 
 
 def _stated_pixel_format(feature: LeRobotFeature) -> str | None:
@@ -149,30 +145,11 @@ def dequantise_depth(feature: LeRobotFeature, codes: np.ndarray, file: Path) -> 
     Raises:
         FormatError: codes of more bits, or an invalid range in the feature's info.
     """
-    if codes.dtype != np.uint16 or codes.max(initial=0) >= _N_DEPTH_CODES:
+    if codes.dtype != np.uint16 or codes.max(initial=0) >= N_CODES:
         raise FormatError(file, f"{feature.key} pixels", f"{codes.dtype} up to {codes.max(initial=0)}", "12-bit codes")
-    table = _metres_by_code(feature, file)
-    low, high = find_return_range(feature, file)
-    return np.where((table > low) & (table <= high), table, 0.0)[codes]
-
-
-def find_return_range(feature: LeRobotFeature, file: Path, rounding: float = 0.0) -> tuple[float, float]:
-    """Lower and upper limit in m of the returns of a depth video: the two codes at either end lie outside.
-
-    Args:
-        feature: its info states the range of the codes.
-        file: named in errors.
-        rounding: largest error in m of the decoded depth; returns that near an end code are left out as well.
-
-    Raises:
-        FormatError: an invalid range in the feature's info.
-    """
-    table = _metres_by_code(feature, file)
-    low, high = (
-        table[1] + max(rounding, (table[2] - table[1]) / 2),
-        table[-2] - max(rounding, (table[-2] - table[-3]) / 2),
-    )
-    return float(low), float(high)
+    metres = metres_by_code(feature.info, feature.key, file)
+    low, high = find_return_range(feature.info, feature.key, file)
+    return np.where((metres > low) & (metres <= high), metres, 0.0)[codes]
 
 
 def decode_depth_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.ndarray:
@@ -184,19 +161,3 @@ def decode_depth_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.nda
     if data[:2] in (b"II", b"MM"):
         return decode_tiff(data, file, hw)
     return files.decode_depth_png(data, file, 1.0, hw).astype(np.uint16)
-
-
-def _metres_by_code(feature: LeRobotFeature, file: Path) -> np.ndarray:
-    """Table code → m, from ``depth_min`` to ``depth_max``."""
-    numbers = []
-    for key, default in _DEFAULT_DEPTH_RANGE.items():
-        value = feature.info.get(f"video.{key}", feature.info.get(key, default))
-        numbers.append(float(files.to_array(value, (), file, f"{feature.key} {key}")))
-    low, high, shift = numbers
-    log = feature.info.get("video.use_log", feature.info.get("use_log", True))
-    if not 0 <= low < high <= 1e4 or (log and not 1e-6 < low + shift <= 1e4):  # only the logarithm needs a shift
-        raise FormatError(file, f"{feature.key} depth_min, depth_max, shift", numbers, "a range of metres")
-    fraction = np.arange(_N_DEPTH_CODES) / (_N_DEPTH_CODES - 1)
-    if log:
-        return np.exp((1 - fraction) * np.log(low + shift) + fraction * np.log(high + shift)) - shift
-    return low + fraction * (high - low)
