@@ -306,7 +306,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("OutputFolder._remove_unfinished", "Path(place) == unfinished or is_unfinished(name)", "True"),
         ("open_output_folder", "opened._remove_unfinished()", "pass"),
         ("open_output_folder", "if is_new:", "if True:"),
-        ("open_output_folder", "if (home / name).is_symlink():", "if False:"),
+        ("open_output_folder", "stat.S_IFMT(status.st_mode) != kind:", "False:"),
         ("open_output_file", "folder.check([file])", "pass"),
         ("open_output_file", "is_inside = (file.parent / PRIVATE_FOLDER).is_dir()", "is_inside = False"),
         ("find_output_folder", "len(each.root.parts)", "-len(each.root.parts)"),

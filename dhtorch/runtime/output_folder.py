@@ -294,10 +294,8 @@ def open_output_folder(
     for name, kind in ((_LOCK, stat.S_IFREG), (_MANIFEST, stat.S_IFREG), (_UNFINISHED, stat.S_IFDIR)):
         status = _read_status(home / name)
         if status is not None and stat.S_IFMT(status.st_mode) != kind:
-            found = f"{home / name}, {describe_kind(status.st_mode)}"
-            raise FileExistsError(
-                f"{option}: found {found}, expected dhtorch's own {describe_kind(kind)[2:]}; remove it"
-            )
+            what = f"{describe_kind(status.st_mode)}, expected dhtorch's own {describe_kind(kind)[2:]}"
+            raise FileExistsError(f"{option}: found {home / name}, {what}; remove it")
     try:
         with acquire_file_lock(home / _LOCK, f"{option}: {path if only is None else only}"):
             opened._remove_unfinished()

@@ -90,8 +90,8 @@ def check_file_or_folder(path: Path, expected: str) -> None:
     try:
         mode = path.stat().st_mode
     except _OPEN_ERRORS as error:
-        found = error if isinstance(error, PermissionError) else "no such file or folder"
-        raise FormatError(path, "path", found, expected) from None
+        reason = error if isinstance(error, PermissionError) else "no such file or folder"
+        raise FormatError(path, "path", reason, expected) from None
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise FormatError(path, "path", describe_kind(mode), expected)
 

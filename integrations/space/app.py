@@ -43,12 +43,12 @@ def unpack(upload: Path, folder: Path) -> Path:
                 raise ValueError(f"{upload.name}: found {size:,} bytes, expected at most {MAX_CONTENT_BYTES:,}")
             for entry in archive.infolist():
                 if not (folder / entry.filename).resolve().is_relative_to(folder.resolve()):
-                    found = f"the name {entry.filename!r}"
-                    raise ValueError(f"{upload.name}: found {found}, expected names inside the archive")
+                    name = f"the name {entry.filename!r}"
+                    raise ValueError(f"{upload.name}: found {name}, expected names inside the archive")
             archive.extractall(folder)
     except _ARCHIVE_ERRORS as error:
-        found = str(error) or type(error).__name__
-        raise ValueError(f"{upload.name}: found {found}, expected a whole zip archive without a password") from None
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{upload.name}: found {reason}, expected a whole zip archive without a password") from None
     inside = [path for path in folder.iterdir() if not path.name.startswith(("__MACOSX", "."))]
     return inside[0] if len(inside) == 1 and inside[0].is_dir() else folder
 
