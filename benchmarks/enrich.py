@@ -143,7 +143,7 @@ def cameras(source: Sequence[Recording]) -> int:
 
 def digest(path: Path) -> str:
     """Of all that lies there."""
-    return result_files.compute_data_digest(result_files.list_files_below([path]))
+    return result_files.compute_data_digest(result_files.list_files_below([(path, None)]))
 
 
 # ------------------------------------------------------------------------------------------------------ comparing

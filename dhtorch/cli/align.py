@@ -35,7 +35,6 @@ from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
-from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import draw_aligned
@@ -151,7 +150,8 @@ def _make_alignment_task(
     first = maps[frames[0]]
     assert first is not None
     layout = select_layout(recording, settings["format"], settings["unit"], same=first.shape[-2:] == hw)
-    digest = result_files.compute_data_digest(_list_data_files(scene, maps, frames))
+    more: dict[str, Path | str] = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
+    digest = completed.digest_scene_files(scene, settings, out, more | {"depth unit": f"{maps.unit.metres} m"})
     options = {**settings, **dict.fromkeys(completed.EXTRA_FILES, False)}
     return CompletionTask(
         scene=scene,
@@ -165,13 +165,6 @@ def _make_alignment_task(
             scene, layout, settings, digest, keyed=_KEY_OPTIONS, roots=_CODE_ROOTS, calibration=None, word="align"
         ),
     )
-
-
-def _list_data_files(scene: Scene, maps: DepthMaps, frames: Sequence[int]) -> dict[str, Path | str]:
-    """Name -> path of all input files: the scene's and the maps'."""
-    maps_by_name = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
-    root = scene.root
-    return {**result_files.list_files_below([root]), **maps_by_name}
 
 
 def _align_frame(task: CompletionTask, maps: DepthMaps, i: int) -> tuple[Frame, DepthMap, Row]:

@@ -119,15 +119,17 @@ def build_shared_metadata(
     return metadata
 
 
-def digest_scene_files(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
-    """Digest of all data files outside the output folder."""
+def digest_scene_files(
+    scene: Scene, settings: Mapping[str, Any], out: Path, more: Mapping[str, Path | str] | None = None
+) -> str:
+    """Digest of all data files outside the output folder, and of ``more``, as for ``compute_data_digest``."""
     files: dict[str, Path | str] = {
-        **result_files.list_files_below([scene.root]),
+        **result_files.list_files_below([(scene.root, scene.recording.bounds)]),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
     output = out.resolve()
     outside = {k: p for k, p in files.items() if isinstance(p, str) or not p.resolve().is_relative_to(output)}
-    return result_files.compute_data_digest(outside)
+    return result_files.compute_data_digest({**outside, **(more or {})})
 
 
 @contextlib.contextmanager

@@ -340,7 +340,7 @@ def _build_metadata(
     """Metadata shared by all files of the data set, with their key."""
     config = {k: settings[k] for k in _KEY_OPTIONS}
     files: dict[str, Path | str] = {
-        **result_files.list_files_below(whole.roots),
+        **result_files.list_files_below(whole.roots.items()),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
     digest = result_files.compute_data_digest(files)
@@ -348,7 +348,7 @@ def _build_metadata(
         device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe_operators()
     )
     name = settings["choices"]["data"]
-    source = whole.roots[0].resolve().name if whole.roots else name
+    source = next((root.resolve().name for root in whole.roots), name)
     metadata: Row = storage.to_strict_json(
         {
             "format": _FORMAT_VERSION,
@@ -419,7 +419,7 @@ def _camera_key(work: EnrichJob, n: int) -> str:
 
 def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
-    files = result_files.list_files_below([work.out]).values()
+    files = result_files.list_files_below([(work.out, work.out)]).values()
     size = sum(path.stat().st_size for path in files if isinstance(path, Path))
     frames = sum(own["length"] for own in owns)
     kept = f" ({n_untouched} left untouched)" if n_untouched else ""

@@ -201,7 +201,7 @@ def download(address: str, folder: Path, digest: str | None, max_bytes: int = MA
         raise OSError(f"{address}: found {total} bytes, expected {start + int(length)}; run again to go on")
     try:
         if digest is not None:
-            _check_digest(_file_sha256(part), digest, address)
+            _check_digest(storage.compute_file_digest(part), digest, address)
     except ValueError:
         part.unlink()
         raise
@@ -268,7 +268,7 @@ def _read_member(archive: tarfile.TarFile | zipfile.ZipFile, name: str, address:
 
 
 def _has_digest(path: Path, digest: str) -> bool:
-    return path.is_file() and not path.is_symlink() and _file_sha256(path) == digest
+    return path.is_file() and not path.is_symlink() and storage.compute_file_digest(path) == digest
 
 
 def _check_digest(actual: str, expected: str, where: str) -> None:
@@ -278,8 +278,3 @@ def _check_digest(actual: str, expected: str, where: str) -> None:
 
 def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _file_sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

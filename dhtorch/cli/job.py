@@ -230,7 +230,8 @@ def _resolve_data(data: Any) -> Sequence[Scene] | Sequence[FocalStacks]:
 
 def _list_data_files(data_sets: Iterable[Scene | FocalStacks]) -> dict[str, Path | str]:
     """Name → path of all data files below the scenes' folders."""
-    return result_files.list_files_below(each.root for each in data_sets)
+    sources = [each if isinstance(each, FocalStacks) else each.recording for each in data_sets]
+    return result_files.list_files_below((source.root, source.bounds) for source in sources)
 
 
 def _list_settings_files(settings: Mapping[str, Any]) -> dict[str, Path]:

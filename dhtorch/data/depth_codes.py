@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from dhtorch.data.io.safe_open import FormatError
+from dhtorch.runtime.safe_open import FormatError
 
 CODE_BITS: Final = 12
 N_CODES: Final = 2**CODE_BITS

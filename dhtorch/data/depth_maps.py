@@ -34,7 +34,7 @@ from dhtorch.data.stored_sizes import check_orientation
 from dhtorch.data.units import UNIT_METRES, DepthUnit, parse_unit
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.runtime.console import format_count
-from dhtorch.runtime.safe_open import check_link, modification_time_ns, restrict_links
+from dhtorch.runtime.safe_open import check_link, read_version, restrict_links
 
 _SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
 
@@ -294,11 +294,11 @@ def _read_map(file: Path) -> np.ndarray:
 
 def _open_clip(file: Path) -> np.ndarray:
     """NPY or NPZ file → its maps (N, h, w); N = 1 where it holds one map, or none. The last file stays in memory."""
-    return _read_clip(file, modification_time_ns(file))
+    return _read_clip(file, read_version(file))
 
 
 @lru_cache(maxsize=1)
-def _read_clip(file: Path, time_ns: int) -> np.ndarray:
+def _read_clip(file: Path, _version: tuple[int, ...]) -> np.ndarray:
     array = _ARRAY_READERS[file.suffix.lower()](file)
     for axis in (-1, 1):
         if array.ndim == 4 and array.shape[axis] == 1:

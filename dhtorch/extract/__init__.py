@@ -171,7 +171,7 @@ def _shared_metadata(
     """Metadata shared by all shards: meaning of the columns, settings, data, versions and key."""
     key_options = {k: v for k, v in asdict(options).items() if k not in _OPTIONS_NOT_IN_KEY}
     config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": key_options}
-    files = {**result_files.list_files_below(extraction_plan.roots), **result_files.list_files_named(config)}
+    files = {**result_files.list_files_below(extraction_plan.roots.items()), **result_files.list_files_named(config)}
     name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
     run_metadata = result_files.collect_run_metadata(
         device="cpu", dtype="float32", threads=1, seed=settings["seed"], operators=loader.describe_operators()

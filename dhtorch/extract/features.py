@@ -16,7 +16,7 @@ from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
 from dhtorch.data.io.decode import FormatError
 from dhtorch.extract.columns import KEY_COLUMNS
 from dhtorch.extract.shards import read_shard_metadata, shard_files
-from dhtorch.runtime.safe_open import modification_time_ns
+from dhtorch.runtime.safe_open import read_version
 from dhtorch.transforms.sample_access import get_value
 
 #: Maximum number of row groups cached in a process.
@@ -115,19 +115,19 @@ class JoinedDataset(Dataset[Any]):
 
 def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
     """File and row -> (index in its row group, columns of the group)."""
-    changed = modification_time_ns(file)
-    starts = _starts(file, changed)
+    version = read_version(file)
+    starts = _starts(file, version)
     group = int(np.searchsorted(starts, row, "right")) - 1
-    return row - starts[group], _group(file, changed, (starts[group], starts[group + 1]), columns)
+    return row - starts[group], _group(file, version, (starts[group], starts[group + 1]), columns)
 
 
 @lru_cache(maxsize=1024)
-def _starts(file: Path, _changed: int) -> tuple[int, ...]:
+def _starts(file: Path, _version: tuple[int, ...]) -> tuple[int, ...]:
     return read_parquet_header(file).groups
 
 
 @lru_cache(maxsize=_MAX_CACHED_GROUPS)
-def _group(file: Path, _changed: int, rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
+def _group(file: Path, _version: tuple[int, ...], rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
     return read_columns(file, columns, rows)
 
 

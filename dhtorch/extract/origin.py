@@ -16,6 +16,7 @@ from dhtorch.data.readers.lerobot_meta import LeRobotEpisodes, LeRobotMeta, read
 from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
 from dhtorch.runtime import safe_open as doors
+from dhtorch.runtime.safe_open import is_inside
 
 #: Rows of one Arrow table in memory.
 TABLE_GROUP_ROWS = 8
@@ -214,7 +215,7 @@ class LeRobotSource:
 
     def _is_inside(self, path: Path) -> bool:
         """Whether a path may be read: inside ``bounds`` after resolving links."""
-        return self.bounds is None or doors.is_inside(path, self.bounds)
+        return self.bounds is None or is_inside(path, self.bounds)
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`DatasetSource.batches`; missing ``frame_index`` and ``task_index`` are added.

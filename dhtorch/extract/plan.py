@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -34,7 +34,7 @@ class ExtractionPlan:
     order: tuple[int, ...]  # index of each recording in the data set
     episodes: tuple[int, ...]  # episode number of each recording, ascending
     ends: tuple[int, ...]  # position after the last frame of each recording
-    roots: tuple[Path, ...]  # folders and files of the recordings
+    roots: Mapping[Path, Path | None]  # folders and files of the recordings, with their ``bounds``
 
     def __len__(self) -> int:
         return self.ends[-1]
@@ -101,7 +101,7 @@ def make_plan(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rig
     recordings: dict[tuple[int, int], tuple[int, str, int]] = {}
     cameras: Counter[int] = Counter()
     rig_episodes: dict[str, int] = {}
-    roots: dict[Path, None] = {}
+    roots: dict[Path, Path | None] = {}
     for k, scene in enumerate(scenes):
         recording = scene.recording
         if not isinstance(gap, str):
@@ -116,7 +116,7 @@ def make_plan(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rig
         recordings[number, cameras[number]] = (k, recording.name, len(recording))
         cameras[number] += 1
         if recording.root is not None:
-            roots[recording.root] = None
+            roots[recording.root] = recording.bounds
     keys = sorted(recordings)
     order, _, lengths = zip(*(recordings[key] for key in keys), strict=True)
-    return ExtractionPlan(order, tuple(number for number, _ in keys), tuple(accumulate(lengths)), tuple(roots))
+    return ExtractionPlan(order, tuple(number for number, _ in keys), tuple(accumulate(lengths)), roots)

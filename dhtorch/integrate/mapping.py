@@ -423,7 +423,8 @@ def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: l
     choices = {group: settings["choices"][group] for group in _CONFIG_GROUPS}
     config = {k: v for k, v in settings.items() if k != "choices"}
     named = result_files.list_files_named({k: config[k] for k in _CONFIG_GROUPS})
-    digest = result_files.compute_data_digest({**result_files.list_files_below(r.root for r in sources), **named})
+    recorded = result_files.list_files_below((scene.root, scene.recording.bounds) for scene in sources)
+    digest = result_files.compute_data_digest({**recorded, **named})
     metrics = ["n_voxels", "n_voxels_sensor", "voxels_vs_sensor", "n_fragments", "n_islands"]
     metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if DenseSweep.from_options(settings["dense"]) is not None else []
     summary = {}

@@ -20,7 +20,15 @@ from typing import Any
 
 from dhtorch.runtime import code_dependencies
 from dhtorch.runtime.output_folder import is_private
-from dhtorch.runtime.storage import dump_strict_json, parse_strict_json, read_utf8, replace_file, to_strict_json
+from dhtorch.runtime.safe_open import is_inside
+from dhtorch.runtime.storage import (
+    compute_file_digest,
+    dump_strict_json,
+    parse_strict_json,
+    read_utf8,
+    replace_file,
+    to_strict_json,
+)
 
 _RESULT_SCHEMA = 1
 
@@ -33,9 +41,6 @@ _JOBS_WITHOUT_QUESTION = ("pair", "integrate")
 _NON_KEY_OPTIONS = frozenset(
     {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
 )
-
-#: Bytes of the head and of the tail of a data file that enter its digest: fast for large files.
-_DIGEST_EDGE_BYTES = 64 * 1024
 
 #: Options left out of a stored result.
 _LOCAL_OPTIONS = ("hydra", "output")
@@ -240,26 +245,45 @@ def compute_result_key(
     return total.hexdigest()
 
 
-def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path | str]:
+def list_files_below(roots: Iterable[tuple[Path | None, Path | None]]) -> dict[str, Path | str]:
     """Name → path of all files below folders (or single files); names are independent of the folders' locations.
 
-    A link that leads out of its folder is a text: its target's name, size and time, so that nothing outside is read.
+    Args:
+        roots: (folder or file, the folder that links must not leave or a file in it; None = links are followed). A link
+            that leaves it, or that leads to a folder listed before, is a text: where it leads.
     """
     files: dict[str, Path | str] = {}
-    for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
-        below = root.rglob("*") if root.is_dir() else [root]
-        paths = [p for p in below if p == root or (p.is_file() and not is_private(p.relative_to(root)))]
-        names = (p.relative_to(root).as_posix() if p != root else p.name for p in paths)
-        files |= {f"{k}/{name}": _path_inside(p, root) for name, p in zip(names, paths, strict=True)}
+    for k, (root, bounds) in enumerate((root, bounds) for root, bounds in dict(roots).items() if root is not None):
+        if root.is_dir():
+            files |= {f"{k}/{path.relative_to(root).as_posix()}": entry for path, entry in _iter_files(root, bounds)}
+        else:
+            files[f"{k}/{root.name}"] = root
     return files
 
 
-def _path_inside(path: Path, root: Path) -> Path | str:
-    """The path, or for a link that leads out of the folder ``root`` a text with its target, size and time."""
-    if path == root or not path.is_symlink() or path.resolve().is_relative_to(root.resolve()):
-        return path
-    status = path.stat()
-    return f"link to {path.readlink()} {status.st_size} {status.st_mtime_ns}"
+def _iter_files(root: Path, bounds: Path | None) -> Iterator[tuple[Path, Path | str]]:
+    """Path of every file and link below a folder, and what :func:`list_files_below` lists for it; folders that cannot
+    be read are left out."""
+    starts, listed = [root], set[str]()
+    for start in starts:  # grows by linked folders
+        if os.path.realpath(start) in listed:
+            yield start, f"link to {start.readlink()}"
+            continue
+        for place, folders, names in os.walk(start):
+            folders.sort()
+            if (real := os.path.realpath(place)) in listed:
+                folders.clear()
+                continue
+            listed.add(real)
+            for path in (Path(place, name) for name in sorted((*folders, *names))):
+                if is_private(path.relative_to(root)):
+                    continue
+                if path.is_symlink() and bounds is not None and not is_inside(path, bounds):
+                    yield path, f"link to {path.readlink()}"
+                elif path.is_symlink() and path.is_dir():
+                    starts.append(path)
+                elif path.is_file():
+                    yield path, path
 
 
 def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
@@ -268,23 +292,16 @@ def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
 
 
 def compute_data_digest(files: Mapping[str, Path | str]) -> str:
-    """SHA-256 over data files: relative names, sizes, first and last 64 KiB; no files for synthetic data.
+    """SHA-256 over data files: their names and the SHA-256 of their content; no files for synthetic data.
 
     Args:
         files: relative name → path, which itself does not enter, or a text, which does.
     """
     total = hashlib.sha256()
     for name in sorted(files):
-        path = files[name]
-        if isinstance(path, str):
-            _update_digest(total, f"{name} {path}".encode())
-            continue
-        size = path.stat().st_size
-        _update_digest(total, f"{name} {size}".encode())
-        with path.open("rb") as file:
-            _update_digest(total, file.read(_DIGEST_EDGE_BYTES))
-            file.seek(max(0, size - _DIGEST_EDGE_BYTES))
-            _update_digest(total, file.read(_DIGEST_EDGE_BYTES))
+        entry = files[name]
+        _update_digest(total, name.encode())
+        _update_digest(total, entry.encode() if isinstance(entry, str) else bytes.fromhex(compute_file_digest(entry)))
     return total.hexdigest()
 
 
@@ -469,7 +486,7 @@ def _iter_paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
     elif isinstance(value, list | tuple):
         for k, inner in enumerate(value):
             yield from _iter_paths(f"{name}.{k}", inner)
-    elif isinstance(value, str) and os.sep in value:
+    elif isinstance(value, str) and (os.sep in value or Path(value).suffix):
         yield name, Path(value).expanduser()
 
 

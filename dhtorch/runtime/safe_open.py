@@ -183,14 +183,24 @@ def check_memory(file: Path, field: str, takes: int, value: object, requested: i
         raise FormatError(file, field, f"{value}: {takes} bytes of memory", f"at most {limit}")
 
 
-def modification_time_ns(file: Path) -> int:
-    """Time of a file's last modification in ns, used as part of the key of caches of its content.
+def read_file_version(path: Path) -> tuple[int, ...]:
+    """Device, inode, size, time of modification and time of change (ns) of a file: a write gives another version.
+
+    The time of change is the system's: no program can set it back, as it can that of modification (on Windows it is the
+    time of creation). Two writes within one step of the file system's clock may give one version.
+    """
+    status = path.stat()
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def read_version(file: Path) -> tuple[int, ...]:
+    """As :func:`read_file_version`, used as part of the key of caches of a file's content.
 
     Raises:
         FormatError: the file is missing or unreadable.
     """
     try:
-        return file.stat().st_mtime_ns
+        return read_file_version(file)
     except _OPEN_ERRORS as error:
         raise unreadable_error(file, error) from None
 

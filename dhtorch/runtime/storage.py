@@ -6,17 +6,19 @@ Strict JSON is the subset that all JSON parsers read alike: no ``NaN``, no ``Inf
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 from dhtorch.runtime import output_folder
-from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, open_regular, read_bytes
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, open_regular, read_bytes, read_file_version
 
 #: Maximum nesting of lists and objects in a file, as they are traversed by recursion.
 _MAX_NESTING = 64
@@ -26,6 +28,13 @@ _UNFINISHED_NAME_CHARACTERS = 32
 
 #: Permissions of a written file: readable by all, writable by its owner.
 _FILE_MODE = 0o644
+
+#: Age in ns from which on a file's digest is kept: two writes within one step of the file system's clock may give one
+#: version. Source: FAT's step, 2 s, the longest of the file systems in use.
+_SETTLED_NS = 2_000_000_000
+
+#: Digests of this process: version of a file (:func:`read_file_version`) → SHA-256.
+_digests: dict[tuple[int, ...], str] = {}
 
 
 def to_strict_json(value: Any) -> Any:
@@ -170,14 +179,30 @@ def _name_unfinished(path: Path) -> Path:
     return Path(name)
 
 
+def compute_file_digest(path: Path) -> str:
+    """SHA-256 of all bytes of a file, in hex; a version of a file is read once in a process."""
+    now_ns = time.time_ns()
+    version = read_file_version(path)
+    if (known := _digests.get(version)) is not None:
+        return known
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if now_ns - max(version[-2:]) > _SETTLED_NS:
+        _digests[version] = digest
+    return digest
+
+
 def copy_file(source: str | Path, path: str | Path) -> Path:
-    """Copy a file atomically; does nothing if the source is missing or ``path`` already has its size.
+    """Copy a file atomically; does nothing if the source is missing or ``path`` already has its bytes.
 
     Raises:
         FormatError: the source is a link to outside the capture being read.
     """
     source, path = Path(source), Path(path)
-    if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
+    if not source.is_file():
+        return path
+    is_as_long = path.is_file() and path.stat().st_size == source.stat().st_size
+    if is_as_long and compute_file_digest(path) == compute_file_digest(source):
         return path
     with open_regular(source) as source_file, write_atomically(path) as file:
         shutil.copyfileobj(source_file, file)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from support import stored_outputs
+from support.byte_damage import change_middle
 
 from dhtorch import data
 from dhtorch.cli import run
@@ -62,6 +63,21 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     assert before.keys() == after.keys()
     assert sum(before[p] != after[p] for p in before) == 1
     assert run.main([*asked, "kind=affine"]) == run.EXIT_FAILED, "other maps in the same folder"
+
+
+def test_a_byte_of_a_map_or_its_unit_makes_another_run(tmp_path, room, capsys):
+    """A change in the middle of a map of the same size and time is one of the data; so is another unit stated."""
+    depth = np.zeros((6, 96, 128), np.float32)
+    depth[0] = room.truth(0)["depth"][0].numpy()
+    np.save(tmp_path / "maps.npy", depth)
+    words = ["align", *ROOM, *LITTLE, f"depth={tmp_path}", f"out={tmp_path / 'out'}", "max_frames=1"]
+    assert run.main(words) == run.EXIT_DONE
+    change_middle(tmp_path / "maps.npy")
+    assert run.main(words) == run.EXIT_FAILED and "files of another run (other data)" in capsys.readouterr().err
+    change_middle(tmp_path / "maps.npy")
+    assert run.main(words) == run.EXIT_DONE and "1 left untouched" in capsys.readouterr().out
+    (tmp_path / "complete.json").write_text('{"unit_m": 0.5}')
+    assert run.main(words) == run.EXIT_FAILED and "files of another run (other data)" in capsys.readouterr().err
 
 
 @pytest.mark.slow

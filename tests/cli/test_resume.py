@@ -250,7 +250,7 @@ def test_changed_data_are_another_question(command, tmp_path):
     assert command(*asked, f"data.root={tmp_path / 'set'}")[0] == 0
     (path,) = results(tmp_path)
     config, digest = result_files.read_result(path)["config"], result_files.read_result(path)["data"]["digest"]
-    assert digest == result_files.compute_data_digest(result_files.list_files_below([tmp_path / "set"]))
+    assert digest == result_files.compute_data_digest(result_files.list_files_below([(tmp_path / "set", None)]))
     assert config["data"]["root"] == "set", "no place of this machine"
     same = [*asked, f"data.root={tmp_path / 'set'}"]
     assert "left untouched" in command(*same)[1]

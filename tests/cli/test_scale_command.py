@@ -10,6 +10,7 @@ from dhtorch.cli import run
 from dhtorch.measure import read_model
 from dhtorch.testing.layouts import write_counted_frames
 from tests.support import room_models as made
+from tests.support.byte_damage import change_middle, overwrite
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,24 @@ def test_a_model_is_written_in_metres(capture, model, capsys):
     assert "1 unit = " in printed
     stored_outputs.check("scale", folder.parent, printed=printed.replace(str(capture), "CAPTURE"), folder=out)
     assert (out / "scale.html").read_text().count("data:image/png;base64,") == 3
+
+
+@pytest.mark.slow
+def test_the_folder_of_another_model_gets_this_ones_cameras_and_a_foreign_file_stays(capture, model, capsys):
+    folder, out = model[0], model[0].with_name("out")
+    words = ["scale", str(folder), str(capture), "--cutoff", "2.5", "--max-frames", "3", "--out", str(out)]
+    assert run.main(words) == 0
+    lines = (folder / "cameras.txt").read_text().splitlines()
+    overwrite(folder / "cameras.txt", "\n".join([lines[0], *(x[:-1] + "1" for x in lines[1:]), ""]).encode())
+    assert (out / "cameras.txt").read_bytes() != (folder / "cameras.txt").read_bytes()
+    assert run.main(words) == 0
+    assert (out / "cameras.txt").read_bytes() == (folder / "cameras.txt").read_bytes()
+    change_middle(out / "cameras.txt")
+    foreign = (out / "cameras.txt").read_bytes()
+    capsys.readouterr()
+    assert run.main(words) == run.EXIT_FAILED
+    assert "cameras.txt, a file that was changed since dhtorch wrote it, expected none" in capsys.readouterr().err
+    assert (out / "cameras.txt").read_bytes() == foreign
 
 
 @pytest.mark.slow

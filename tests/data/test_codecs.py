@@ -13,14 +13,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.byte_damage import overwrite
 
+from dhtorch.data.codecs import bag_messages, parquet
 from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.codecs import lzfse as codec_lzfse
 from dhtorch.data.codecs import mp4 as codec_mp4
 from dhtorch.data.codecs import video as codec_video
+from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError, resolve_inside
 from dhtorch.data.readers import lerobot_meta
+from dhtorch.data.readers.lerobot_rows import read_row_table
+from dhtorch.data.units import DepthUnit
 from dhtorch.testing.mp4 import write_video
 
 lzfse = pytest.importorskip("lzfse")
@@ -323,3 +328,47 @@ def test_counts_are_whole_numbers_below_a_limit(wrong: float, tmp_path: Path) ->
     assert lerobot_meta._check_counts(good, tmp_path / "a.parquet", "length", 10).tolist() == [0, 9]
     with pytest.raises(FormatError, match=f"length: found {wrong}, expected a count"):
         lerobot_meta._check_counts(np.array([0.0, wrong]), tmp_path / "a.parquet", "length", 10)
+
+
+# ------------------------------------------------------------------------------------------------------------- caches
+
+
+def write_table(file: Path, value: int) -> None:
+    arrow, table = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    columns = {"timestamp": np.arange(9.0), "frame_index": np.full(9, value), "episode_index": np.zeros(9, np.int64)}
+    table.write_table(arrow.table(columns), file, use_dictionary=False, compression="none")
+
+
+def write_maps(file: Path, value: int) -> None:
+    np.save(file, np.full((2, 4, 6), value, np.float32))
+
+
+def read_chunk(file: Path) -> int:
+    return bag_messages.cached_chunk(file, 3, lambda: file.read_bytes()[3:4])[0]
+
+
+#: Content cached in a process: name of the file, how it is written with a value, and how the value is read.
+CACHED: dict[str, tuple[str, Callable[[Path, int], object], Callable[[Path], object]]] = {
+    "cell": ("a.parquet", write_table, lambda file: parquet.read_cell(file, "frame_index", 4)),
+    "rows": ("a.parquet", write_table, lambda file: read_row_table(file, ())["frame_index"][4]),
+    "maps": ("a.npy", write_maps, lambda file: DepthMaps([file], DepthUnit(1.0), (4, 6), clip_index=[1])[0].max()),
+    "chunk": ("a.bag", lambda file, value: file.write_bytes(bytes([value] * 9)), read_chunk),
+    "frame": (
+        "a.mp4",
+        lambda file, value: write_video(file, [grey(value)] * 3, [0, 0.1, 0.2], codec="libx264"),
+        lambda file: number(codec_video.read_video_frame(file, 1)),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CACHED)
+def test_content_cached_in_a_process_is_that_of_the_file(tmp_path: Path, kind: str) -> None:
+    """Also after a change that leaves the file's size and time of modification as they were."""
+    name, write, read = CACHED[kind]
+    write(tmp_path / name, 3)
+    write(tmp_path / f"new_{name}", 5)
+    assert read(tmp_path / name) == 3
+    content = (tmp_path / f"new_{name}").read_bytes()
+    assert len(content) == (tmp_path / name).stat().st_size or kind == "frame"
+    overwrite(tmp_path / name, content)
+    assert read(tmp_path / name) == 5

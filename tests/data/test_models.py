@@ -11,6 +11,7 @@ from support.byte_damage import STRANGE_FILES
 from dhtorch.data import FormatError
 from dhtorch.data.models import Similarity, network, read_model, scene_model, write_model
 from tests.support import room_models as made
+from tests.support.byte_damage import change_middle
 
 WRITERS = {
     "colmap txt": (made.write_colmap_text, "points"),
@@ -69,6 +70,19 @@ def test_a_model_is_written_after_a_similarity(tmp_path, kind, turned):
     if len(model.xyz):
         np.testing.assert_allclose(again.xyz, similarity.apply(model.xyz), rtol=1e-5, atol=2e-5)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("kind", ["colmap txt", "colmap bin", "nerfstudio"])
+def test_a_folder_of_another_model_gets_all_files_of_this_one(tmp_path, kind):
+    """Cameras and pictures of equal size but with other bytes are written anew."""
+    _, folder = write(tmp_path, kind)
+    copied = [p for p in folder.rglob("*") if p.stem.startswith(("cameras", "0000"))]
+    assert copied
+    for _ in range(2):
+        write_model(read_model(folder), tmp_path / "out", Similarity(2.0, np.eye(3), np.zeros(3)))
+        for file in copied:
+            assert (tmp_path / "out" / file.relative_to(folder)).read_bytes() == file.read_bytes()
+            change_middle(file)
 
 
 def test_a_similarity_turns_scales_and_shifts() -> None:

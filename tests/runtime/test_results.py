@@ -8,6 +8,7 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -15,10 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.byte_damage import change_middle
 from support.small_result import KEY, result
 
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import open_output_folder
 
 
 def test_a_result_survives_the_disk_and_is_strict(tmp_path):
@@ -186,24 +189,53 @@ def test_the_key_is_of_settings_code_and_data(tmp_path):
     result_files.validate_result({**result(), "key": result_files.compute_result_key(config, "")})
 
 
-def test_the_digest_reads_names_sizes_and_both_ends(tmp_path):
-    head, tail = b"h" * result_files._DIGEST_EDGE_BYTES, b"t" * result_files._DIGEST_EDGE_BYTES
-    one = tmp_path / "one"
+def test_the_digest_reads_names_and_every_byte(tmp_path):
+    one, elsewhere = tmp_path / "one", tmp_path / "two"
     digest = lambda data, name="a/depth.bin": (one.write_bytes(data), result_files.compute_data_digest({name: one}))[1]  # noqa: E731
-    first = digest(head + b"middle" + tail)
-    assert first == digest(head + b"MIDDLE" + tail), "only the two ends are read"
-    assert first not in {
-        digest(head + b"middle" + tail, "b/depth.bin"),
-        digest(head + b"middles" + tail),
-        digest(b"x" + head[1:] + b"middle" + tail),
-        digest(head + b"middle" + tail[1:] + b"x"),
-    }
-    elsewhere = tmp_path / "two"
+    content = bytes(300_000)
+    first = digest(content)
+    assert first not in {digest(content, "b/depth.bin"), digest(content + b"x"), digest(content[1:])}
+    assert digest(content) == first
+    for _ in range(2):  # there and back
+        change_middle(one)
+        assert (result_files.compute_data_digest({"a/depth.bin": one}) == first) == (one.read_bytes() == content)
     elsewhere.write_bytes(b"short")
     assert digest(b"short") == result_files.compute_data_digest({"a/depth.bin": elsewhere})
     assert result_files.compute_data_digest({"a": one, "b": elsewhere}) == result_files.compute_data_digest(
         {"b": elsewhere, "a": one}
     )
+
+
+def test_a_file_is_hashed_once_until_it_changes(tmp_path, monkeypatch):
+    """A file younger than the step of a file system's clock is always read: a second write may leave its times."""
+    file, read, now = tmp_path / "a", [], time.time_ns()
+    file.write_bytes(bytes(1000))
+    hashed = storage.hashlib.file_digest
+    monkeypatch.setattr(storage.hashlib, "file_digest", lambda *of: (read.append(1), hashed(*of))[1])
+    first = storage.compute_file_digest(file)
+    assert storage.compute_file_digest(file) == first and len(read) == 2
+    monkeypatch.setattr(storage.time, "time_ns", lambda: now + 10**12)
+    assert {storage.compute_file_digest(file) for _ in range(3)} == {first} and len(read) == 3
+    change_middle(file)
+    assert storage.compute_file_digest(file) != first and len(read) == 4
+
+
+def test_a_copy_has_the_bytes_of_its_source(tmp_path):
+    source, copy = tmp_path / "source", tmp_path / "copy"
+    assert storage.copy_file(source, copy) == copy and not copy.exists(), "no source"
+    source.write_bytes(bytes(300_000))
+    storage.copy_file(source, copy)
+    inode = copy.stat().st_ino
+    storage.copy_file(source, copy)
+    assert copy.read_bytes() == source.read_bytes() and copy.stat().st_ino == inode, "not written again"
+    for changed in (source, copy):
+        change_middle(changed)
+        storage.copy_file(source, copy)
+        assert copy.read_bytes() == source.read_bytes() and changed.stat().st_size == 300_000
+    with open_output_folder(tmp_path / "out", "out"):
+        (tmp_path / "out" / "copy").write_bytes(bytes(300_000))
+        with pytest.raises(FileExistsError, match="a file that dhtorch did not write"):
+            storage.copy_file(source, tmp_path / "out" / "copy")
 
 
 def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch):
@@ -567,19 +599,11 @@ def test_the_digest_tells_what_is_joined_from_what_is_apart(tmp_path):
             (tmp_path / name).write_bytes(text)
         return result_files.compute_data_digest({name: tmp_path / name for name in texts})
 
-    edge = result_files._DIGEST_EDGE_BYTES
-    assert edge == 64 * 1024
     whole = {digest(a=b"one", b=b"two"), digest(a=b"two", b=b"one"), digest(a=b"one"), digest(b=b"one"), digest()}
-    whole |= {digest(a=b"on", b=b"etwo"), digest(a=b""), digest(a=b"\0" * (edge + 1)), digest(a=b"\0" * edge)}
+    whole |= {digest(a=b"on", b=b"etwo"), digest(a=b""), digest(a=b"\0" * 65537), digest(a=b"\0" * 65536)}
     assert len(whole) == 9
     # Written one after the other, names, sizes and contents of these one and two files are the same bytes.
     assert digest(a=b"0b 3xyzxyz") != digest(**{"a": b"0", "b 3xyzxyz0b": b"xyz"})
-    big = bytearray(3 * edge)
-    first = digest(a=bytes(big))
-    for place, counts in ((edge - 1, True), (edge, False), (2 * edge - 1, False), (2 * edge, True)):
-        big[place] = 1
-        assert (digest(a=bytes(big)) != first) == counts, place
-        big[place] = 0
 
 
 def test_files_are_named_by_their_place_below_a_root(tmp_path):
@@ -587,14 +611,14 @@ def test_files_are_named_by_their_place_below_a_root(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     one, two, file = tmp_path / "one" / "set", tmp_path / "two" / "set", tmp_path / "three.npz"
-    found = result_files.list_files_below([one, None, two, one, file])
+    found = result_files.list_files_below([(one, one), (None, None), (two, None), (one, one), (file, file)])
     assert found == {
         "0/a.bin": one / "a.bin",
         "0/sub/b.bin": one / "sub" / "b.bin",
         "1/a.bin": two / "a.bin",
         "2/three.npz": file,
     }
-    assert result_files.list_files_below([]) == result_files.list_files_below([None]) == {}
+    assert result_files.list_files_below([]) == result_files.list_files_below([(None, None)]) == {}
 
 
 def test_files_that_settings_name_are_found_at_every_depth(tmp_path, monkeypatch):
@@ -606,6 +630,7 @@ def test_files_that_settings_name_are_found_at_every_depth(tmp_path, monkeypatch
     settings = {
         "method": {"weights": str(tmp_path / "net.pt"), "seats": [{"a": "sub/list.txt"}, "~/net.pt"], "n": 5},
         "plain": "plain",  # no place, a word
+        "beside": "net.pt",
         "gone": "/nowhere/net.pt",
         "folder": str(tmp_path / "sub"),
     }
@@ -613,6 +638,7 @@ def test_files_that_settings_name_are_found_at_every_depth(tmp_path, monkeypatch
         "settings/.method.weights": tmp_path / "net.pt",
         "settings/.method.seats.0.a": Path("sub/list.txt"),
         "settings/.method.seats.1": tmp_path / "net.pt",
+        "settings/.beside": Path("net.pt"),
     }
 
 
@@ -699,25 +725,41 @@ def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
     assert commit() is None
 
 
-def test_a_link_that_leaves_the_folder_is_not_read(tmp_path):
-    """Its target's name, size and time enter the digest; a link within the folder is a file."""
+def test_what_a_link_leads_to_is_read_where_readers_follow_it(tmp_path):
+    """The path of a target that no reader opens enters the digest; nothing outside is read."""
     root, outside = tmp_path / "set", tmp_path / "outside"
-    root.mkdir()
-    outside.write_text("secret")
-    (root / "a").write_text("a")
-    (root / "inner").symlink_to("a")
-    (root / "link").symlink_to(outside)
-    files = result_files.list_files_below([root])
-    assert files["0/inner"] == root / "inner" and files["0/link"].startswith(f"link to {outside} 6 ")
-    outside.chmod(0)
-    status = outside.stat()
-    first = result_files.compute_data_digest(files)
-    outside.chmod(0o600)
-    outside.write_text("SECRET")
-    os.utime(outside, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert first == result_files.compute_data_digest(result_files.list_files_below([root])), "the content was read"
-    outside.write_text("longer than before")
-    assert first != result_files.compute_data_digest(result_files.list_files_below([root]))
+    for name in ("set/depth/a", "outside/images/b", "outside/c"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    links = {"inner": "depth/a", "again": "depth", "out": outside / "c", "images": outside / "images", "loop": "../set"}
+    for name, target in links.items():
+        (root / name).symlink_to(target)
+    bound, free = (result_files.list_files_below([(root, bounds)]) for bounds in (root, None))
+    inside = {"0/depth/a": root / "depth/a", "0/inner": root / "inner", "0/again": "link to depth"}
+    inside["0/loop"] = "link to ../set"
+    assert bound == inside | {f"0/{name}": f"link to {links[name]}" for name in ("out", "images")}
+    assert free == inside | {"0/out": root / "out", "0/images/b": root / "images/b"}
+    assert result_files.list_files_below([(root / "depth", root)]) == {"0/a": root / "depth/a"}
+    digests = []
+    for _ in range(2):
+        digests += [result_files.compute_data_digest(files) for files in (bound, free)]
+        change_middle(outside / "images/b")
+    assert digests[0] == digests[2] and digests[1] != digests[3]
+
+
+def test_a_folder_that_cannot_be_read_is_left_out(tmp_path, monkeypatch):
+    for name in ("a", "closed/b"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    scan = os.scandir
+
+    def refuse(folder):
+        if Path(folder).name == "closed":
+            raise PermissionError(folder)
+        return scan(folder)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert result_files.list_files_below([(tmp_path, None)]) == {"0/a": tmp_path / "a"}
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,26 @@ def iter_strange(good: Capture) -> Iterator[tuple[str, Capture]]:
         yield from ((f"{name}: {what}", good | {name: make}) for what, make in STRANGE_FILES.items())
 
 
+def overwrite(file: Path, content: bytes) -> None:
+    """Other content for a file whose inode and time of modification stay."""
+    before = file.stat()
+    for _ in range(100_000):  # until the file system's clock, which moves in steps, has another time of the change
+        with file.open("r+b") as stream:
+            stream.write(content)
+            stream.truncate()
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+        if file.stat().st_ctime_ns != before.st_ctime_ns:
+            return
+    raise AssertionError(f"{file}: the time of the change stands still")
+
+
+def change_middle(file: Path) -> None:
+    """Change the byte in the middle of a file whose size, inode and time of modification stay."""
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    overwrite(file, bytes(content))
+
+
 def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
     """(description, damaged capture): mostly one file changed, sometimes two, or files removed or exchanged."""
     want = dict(good)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from dhtorch.data.io.decode import FormatError, import_optional
-from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_memory, modification_time_ns
+from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_memory, read_version
 
 #: Bytes of a message that indexing reads: header, size and encoding of a picture.
 HEAD_BYTES: Final = 1024
@@ -81,7 +81,7 @@ def decompress_chunk(data: bytes, compression: str, size: int, file: Path) -> by
 
 def cached_chunk(file: Path, offset: int, load: Callable[[], bytes]) -> bytes:
     """Content of the chunk at ``offset``, kept for the messages beside it."""
-    key = (file, offset, modification_time_ns(file))
+    key = (file, offset, read_version(file))
     if key not in _chunks:
         while len(_chunks) >= _CHUNKS_KEPT:
             _chunks.popitem(last=False)
@@ -90,7 +90,7 @@ def cached_chunk(file: Path, offset: int, load: Callable[[], bytes]) -> bytes:
     return _chunks[key]
 
 
-_chunks: OrderedDict[tuple[Path, int, int], bytes] = OrderedDict()
+_chunks: OrderedDict[tuple[Path, int, tuple[int, ...]], bytes] = OrderedDict()
 
 
 def _unpack_zstd(data: bytes, size: int) -> bytes:

@@ -20,8 +20,8 @@ from dhtorch.runtime.safe_open import (
     MAX_MEMORY_BYTES,
     MAX_MEMORY_RATIO,
     MAX_TEXT_BYTES,
-    modification_time_ns,
     open_regular,
+    read_version,
     unreadable_error,
 )
 
@@ -110,7 +110,7 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     Raises:
         FormatError: as :func:`read_columns`.
     """
-    key = (file, modification_time_ns(file), column)
+    key = (file, read_version(file), column)
     first, values = _row_group_cache.get(key, (0, ()))
     if not first <= row < first + len(values):
         _row_group_cache.pop(key, None)
@@ -127,8 +127,8 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     return values[row - first]
 
 
-#: Cache of row groups: (file, modification time, column) → first row and values.
-_row_group_cache: OrderedDict[tuple[Path, int, str], tuple[int, Any]] = OrderedDict()
+#: Cache of row groups: (file, its version, column) → first row and values.
+_row_group_cache: OrderedDict[tuple[Path, tuple[int, ...], str], tuple[int, Any]] = OrderedDict()
 _MAX_CACHED = 4
 
 
@@ -231,7 +231,7 @@ def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> N
 
 def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
     """The chunks of the given row groups; parsed here, since Arrow aborts the process on damaged chunk metadata."""
-    key = (file, modification_time_ns(file), groups)
+    key = (file, read_version(file), groups)
     if key in _chunk_cache:
         return _chunk_cache[key]
     size = _footer_size(file)
@@ -249,8 +249,8 @@ def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
     return chunks
 
 
-#: Cache of chunks: (file, modification time, row groups) → chunks.
-_chunk_cache: OrderedDict[tuple[Path, int, frozenset[int]], list[_Chunk]] = OrderedDict()
+#: Cache of chunks: (file, its version, row groups) → chunks.
+_chunk_cache: OrderedDict[tuple[Path, tuple[int, ...], frozenset[int]], list[_Chunk]] = OrderedDict()
 
 
 def _parse_chunk(fields: dict[int, Any]) -> _Chunk:

@@ -21,7 +21,7 @@ import numpy as np
 
 from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count, read_display_symmetry
 from dhtorch.data.io.decode import FormatError, import_optional
-from dhtorch.runtime.safe_open import modification_time_ns, open_regular
+from dhtorch.runtime.safe_open import open_regular, read_version
 
 _MAX_VIDEO_PIXELS = 36_000_000  # pixels, 8K; a decoder holds up to 17 frames
 _MAX_FRAMES = 10_000_000
@@ -257,13 +257,13 @@ class _Decoder:
             yield from frames
 
 
-_open_decoders: OrderedDict[tuple[Path, bool, int, int], _Decoder] = OrderedDict()
+_open_decoders: OrderedDict[tuple[Path, bool, int, tuple[int, ...]], _Decoder] = OrderedDict()
 _inherited_decoders: list[_Decoder] = []
 
 
 def _get_decoder(file: Path, all_frames: bool, track: int) -> _Decoder:
     """A cached decoder of this process, opened if needed."""
-    key = (file, all_frames, track, modification_time_ns(file))
+    key = (file, all_frames, track, read_version(file))
     if key not in _open_decoders:
         while len(_open_decoders) >= _MAX_OPEN_DECODERS:
             _open_decoders.popitem(last=False)[1].container.close()

@@ -29,11 +29,11 @@ def read_row_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     Raises:
         FormatError: a missing or damaged table or column.
     """
-    return _read_cached_table(file, doors.modification_time_ns(file), more)
+    return _read_cached_table(file, doors.read_version(file), more)
 
 
 @lru_cache(maxsize=1)
-def _read_cached_table(file: Path, _modified_ns: int, extra: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _read_cached_table(file: Path, _version: tuple[int, ...], extra: tuple[str, ...]) -> dict[str, np.ndarray]:
     table: dict[str, np.ndarray] = {}
     index_columns = "timestamp", "frame_index", "episode_index"
     for name, values in read_columns(file, [index_columns[0], *extra], optional=index_columns[1:]).items():
