@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from support.byte_damage import change_middle
 from support.room_truth import room_distance
 from support.rooms import room_scene
 
@@ -100,6 +101,26 @@ def test_features_of_an_interrupted_run_are_not_computed_again(tmp_path):
             assert torch.equal(next(shards.read(["b"])).target, x) and shards.n == 4
         assert made_groups == expected
     assert not list(tmp_path.glob("*.partial"))
+
+
+def test_kept_features_of_other_data_are_not_used(tmp_path):
+    x, file, n_made = torch.rand(2, 3), tmp_path / "set" / "frames", []
+    file.parent.mkdir()
+    file.write_bytes(bytes(300_000))
+    scenes = [SimpleNamespace(root=file.parent, recording=SimpleNamespace(bounds=None))]
+
+    def make():
+        n_made.append(len(n_made))
+        return probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0)
+
+    def add():
+        with probing.ProbeShards(tmp_path / "kept", scenes) as shards:
+            shards.add("a", "k", make)
+        return len(n_made)
+
+    assert (add(), add()) == (1, 1)
+    change_middle(file)
+    assert (add(), add()) == (2, 2)
 
 
 def test_controls_show_what_the_split_can_decide():

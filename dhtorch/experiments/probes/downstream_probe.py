@@ -120,7 +120,8 @@ def run(
     outcome = Outcome(metrics=PROBE_METRICS)
     samples = [(s, split_into_samples(s, gap_parts, blocks, min_samples)) for s in scenes_of(scenes)]
     errors_by_split: dict[str, ProbeErrors] = {}
-    with ProbeShards(features) as by_block, ProbeShards(features) as by_stream:
+    sources = [scene for scene, _ in samples]
+    with ProbeShards(features, sources) as by_block, ProbeShards(features, sources) as by_stream:
         for scene, scene_blocks in progress(samples, "enriched sets", len(samples)):
             for k, block in enumerate(scene_blocks):
                 make = cache(partial(_make_shard, scene, block, extract, moving))

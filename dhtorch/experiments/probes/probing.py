@@ -27,12 +27,14 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
+from dhtorch.data.scene import Scene
 from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.protocol import Outcome
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.bootstrap import Interval
+from dhtorch.runtime import results as result_files
 
 #: Main metrics of the experiment.
 PROBE_METRICS = (
@@ -111,12 +113,16 @@ class ProbeShards:
 
     Args:
         folder: kept, so that an interrupted run computes only the shards that are missing; None = a temporary folder.
+        scenes: of the samples; shards in ``folder`` that were computed from other data files are not used.
     """
 
-    def __init__(self, folder: str | Path | None = None) -> None:
+    def __init__(self, folder: str | Path | None = None, scenes: Sequence[Scene] = ()) -> None:
         self._temporary = tempfile.TemporaryDirectory(prefix="dhtorch_probe_") if folder is None else None
         self._folder = Path(self._temporary.name if self._temporary else str(folder))
         self._folder.mkdir(parents=True, exist_ok=True)
+        roots = [(scene.root, scene.recording.bounds) for scene in scenes if folder is not None]
+        files = result_files.list_files_below(roots)
+        self._digest = result_files.compute_data_digest(files)
         self._files: list[tuple[str, Path]] = []
         self._targets: probe.SampleMoments | None = None
         self.widths: dict[str, int] = {}
@@ -127,8 +133,8 @@ class ProbeShards:
 
         Args:
             group: name of the group.
-            key: everything else that the features depend on; its ``repr`` counts, without addresses of objects. Code
-                does not: empty the folder when it changes.
+            key: everything but the data files that the features depend on; its ``repr`` counts, without addresses of
+                objects. Code does not: empty the folder when it changes.
             make: computes the shard.
 
         Raises:
@@ -165,7 +171,7 @@ class ProbeShards:
 
     def _file(self, group: str, key: object) -> Path:
         text = re.sub(r" at 0x[0-9a-f]+", "", repr((group, key)))
-        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.pt"
+        return self._folder / f"{hashlib.sha256((text + self._digest).encode()).hexdigest()[:16]}.pt"
 
     @staticmethod
     def _load(file: Path) -> ProbeShard:

@@ -139,7 +139,7 @@ def run(
     probe.make_folds(tasks, n_folds, seed=settings.seed)  # too few tasks are refused before the features are computed
     method = next(iter(methods.values()))
     outcome = Outcome(metrics=PROBE_METRICS)
-    with ProbeShards(features) as shards:
+    with ProbeShards(features, [scene for scene, _ in chosen]) as shards:
         outcome.rows += [_skip_reason(scene.recording) for scene, samples in chosen if not samples[0]]
         chosen = [(scene, samples) for scene, samples in chosen if samples[0]]
         true_depth = all(isinstance(scene.recording, TruthRecording) for scene, _ in chosen)

@@ -144,7 +144,7 @@ def run(
             probed.setdefault(_ALL_ROOMS if hold_out == "rooms" else room, []).extend(blocks_of)
     needed: dict[str, int | None] = {}
     for name, members_blocks in probed.items():
-        with ProbeShards(features) as shards:
+        with ProbeShards(features, [scene for scene, _ in members_blocks]) as shards:
             parts = [
                 (scene.place if hold_out == "rooms" else f"{scene.name} {k}", scene, block)
                 for scene, scene_blocks in members_blocks
