@@ -82,7 +82,7 @@ def collate(records: Iterable[R], dim: int = 0) -> R:
     Raises:
         ValueError: no record, different kinds of records, a field present in some records only, or unequal shapes.
     """
-    return _join(list(records), lambda xs: torch.cat(xs, dim))
+    return _join(list(records), lambda xs: torch.cat(xs, dim).contiguous())
 
 
 def chunked_apply(fn: Callable[..., R], size: int, *batch: Any) -> R:

@@ -35,6 +35,7 @@ from dhtorch.pipeline.pair import undistort_tracks, uniform_draws
 from dhtorch.pipeline.presets import AUTO, MAP_PYRAMID_LEVELS
 from dhtorch.pytree import collate
 from dhtorch.records import MIN_TRACKABILITY, Camera, Frame, PinResult, Pose, TrackHint, Tracks
+from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
@@ -119,6 +120,7 @@ class CameraPin:
         (False, True)
     """
 
+    @standard_numerics
     def __init__(self, ref: Frame | Sequence[Frame], *, false_alarm_rate: float = 0.01, seed: int = 0) -> None:
         if not 0 < false_alarm_rate < 1:
             raise ValueError(f"CameraPin: false_alarm_rate is {false_alarm_rate}, expected above 0 and below 1")
@@ -130,6 +132,7 @@ class CameraPin:
         if len(frames.image) > 1:
             self._use_capture(frames.detach())
 
+    @standard_numerics
     @torch.no_grad()
     def check(self, image: Tensor, K: Tensor | Camera | None = None) -> PinResult:
         """Compare pictures with the reference.

@@ -1,7 +1,9 @@
-"""Torch's process-wide defaults kept away from computations that state no dtype or device of their own.
+"""Torch's process-wide defaults and the strides of tensors kept away from what a public computation gives.
 
 ``torch.set_default_dtype``, ``torch.set_default_device`` and ``torch.autocast`` change what ``torch.eye(2)`` or a
 matrix product gives. Poses, covariances and depth in metres need float32 at least, so results must not depend on them.
+The order in which torch sums depends on strides, and compiled operators read contiguous tensors alone: views, as of
+channels-last images, would round differently.
 """
 
 from __future__ import annotations
@@ -9,16 +11,21 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from dhtorch.pytree import Record
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
 def standard_numerics(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Decorator: within a call the default dtype is float32, the default device the CPU, and autocast is off.
+    """Decorator: within a call the default dtype is float32, the default device the CPU, autocast is off, and tensors
+    among the arguments, in records, lists and tuples, too, are contiguous.
 
     Nothing is changed where they are so already, or while ``torch.compile`` traces. The default dtype belongs to the
     process: while a call that had to change it lasts, other threads have float32, too.
@@ -29,9 +36,20 @@ def standard_numerics(function: Callable[_P, _T]) -> Callable[_P, _T]:
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
         with _standard_defaults():
-            return function(*args, **kwargs)
+            values, options = [_contiguous(x) for x in args], {name: _contiguous(x) for name, x in kwargs.items()}
+            return function(*values, **options)  # type: ignore[arg-type]
 
     return wrapped
+
+
+def _contiguous(value: Any) -> Any:
+    """The value with contiguous tensors; other kinds of objects, as dicts that a call fills, are themselves."""
+    if isinstance(value, Tensor):
+        return value.contiguous()
+    if isinstance(value, Record):
+        tensors = [x for x in pytree.tree_leaves(value) if isinstance(x, Tensor)]
+        return value if all(x.is_contiguous() for x in tensors) else value.map(Tensor.contiguous)
+    return type(value)(map(_contiguous, value)) if type(value) in (list, tuple) else value
 
 
 @contextlib.contextmanager

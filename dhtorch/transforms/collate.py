@@ -55,6 +55,6 @@ def _allocate_shared(like: Mapping[str, Tensor], *front: int) -> dict[str, Tenso
     shapes = {key: (*front, *x.shape) for key, x in like.items()}
     sizes = [math.prod(shapes[key]) * x.element_size() for key, x in like.items()]
     starts = list(accumulate((size + -size % _ALIGNMENT_BYTES for size in sizes), initial=0))
-    block = torch.empty(starts[-1], dtype=torch.uint8).share_memory_()
+    block = torch.empty(starts[-1], dtype=torch.uint8, device="cpu").share_memory_()
     rows = zip(like.items(), starts[:-1], sizes, strict=True)
     return {key: block[at : at + size].view(x.dtype).view(shapes[key]) for (key, x), at, size in rows}

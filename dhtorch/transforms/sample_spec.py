@@ -157,7 +157,7 @@ class SampleSpec:
         images = leaves.images(self.image, self.layout)
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
         at = _frame_index(self.at, T, self.image)
-        image = images[:, at]
+        image = images[:, at].contiguous()
         checks = _unit_range_checks(image, self.image)
         ready = self.metric_depth_key in sample
         planes = leaves.planes(self.metric_depth_key if ready else self.depth, T, signed=False)
@@ -180,8 +180,6 @@ class SampleSpec:
             reference = reference.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
         other, paired = self._other(leaves, images, depths, reference, checks)
         motion = None if other is None else self._motion(leaves, T, checks)
-        if other is not None:  # tracking reads all pixels, the front end only a few, which need no copy
-            reference = reference.replace(image=reference.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
         return SampleViews(
             reference, other, paired, bad, has_returns=has_returns, complaints=tuple(checks), pose_prior=motion

@@ -29,7 +29,8 @@ class ProblemCounts:
     """Counts by problem in memory shared with forked and spawned workers, each of which writes its own row."""
 
     def __init__(self) -> None:
-        self.counts = _share_memory(torch.zeros(_MAX_COUNT_ROWS, len(names(SampleProblem)), dtype=torch.int64))
+        counts = torch.zeros(_MAX_COUNT_ROWS, len(names(SampleProblem)), dtype=torch.int64, device="cpu")
+        self.counts = _share_memory(counts)
 
     def add(self, problem: Tensor) -> None:
         """Count problem codes (B,) of samples."""

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support.pose_problems import NOISE, map_pose_inputs, pose_depth_problem
+from support.public_entries import VIEWS, differing_entries, public_results
 from support.tiny_runs import ROOM
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
@@ -122,6 +123,13 @@ def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, 
     for a, b in zip(ours.levels, torchs.levels, strict=True):
         assert a.shape == b.shape and (a - b).abs().max() <= 2.0**-23
     assert not torch.equal(ours.levels[0][0], ours.levels[0][1])
+
+
+@needs_compiler
+def test_public_entries_give_the_bits_of_contiguous_copies(loaded):
+    contiguous = public_results()
+    for layout in VIEWS:
+        assert differing_entries(public_results(layout), contiguous) == [], layout
 
 
 @needs_compiler

@@ -1,13 +1,13 @@
-"""Results do not depend on torch's default dtype, default device or autocast, and these are left as they were."""
+"""Results do not depend on torch's default dtype, default device or autocast, which are left as they were, nor on
+strides."""
 
 import contextlib
 
 import pytest
 import torch
+from support.public_entries import VIEWS, differing_entries, public_results
 
-import dhtorch
-from dhtorch import functional
-from dhtorch.synthetic import SyntheticRoom
+from dhtorch.ops import loader
 
 
 @contextlib.contextmanager
@@ -40,37 +40,24 @@ def state():
     return torch.get_default_dtype(), str(torch.get_default_device()), torch.is_autocast_enabled("cpu")
 
 
-def answers(a, b):
-    """Depth, sigma and gates of the public computations."""
-    few = {"n": 128, "seed": 0}
-    estimates = [dhtorch.PAPER(a, b, **few), dhtorch.AUTO(a, [b], **few)]
-    maps = dhtorch.complete_depth(a, [b], method=dhtorch.FUSED.replace(n=128), size=64)
-    validation = dhtorch.validate_depth(None, a, b, size=48)
-    aligned = dhtorch.align_depth(maps.depth * 3, estimates[0], hw=a.hw, kind="scale")
-    image = functional.geometry_image(maps.depth, maps.sigma, maps.source)
-    return [
-        *(x for e in estimates for x in (e.depth, e.sigma, e.gate)),
-        *(maps.depth, maps.sigma, validation.state, aligned.depth, image),
-    ]
-
-
 @pytest.fixture(scope="module")
-def frames():
-    room = SyntheticRoom(n_frames=3, hw=(90, 120))
-    return room[0], room[2]
-
-
-@pytest.fixture(scope="module")
-def expected(frames):
-    return answers(*frames)
+def expected():
+    return public_results()
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_results_do_not_depend_on_the_defaults_of_torch(frames, expected, name):
+def test_results_do_not_depend_on_the_defaults_of_torch(expected, name):
     with STATES[name]():
         before = state()
-        found = answers(*frames)
+        found = public_results()
         assert state() == before
-    for ours, standard in zip(found, expected, strict=True):
-        assert ours.dtype == standard.dtype and ours.device == standard.device
-        assert torch.equal(ours.nan_to_num(-1), standard.nan_to_num(-1))
+    assert differing_entries(found, expected) == []
+
+
+def test_results_do_not_depend_on_strides(monkeypatch):
+    """Of torch; compiled operators, which read contiguous tensors alone: tests/ops/test_compiled.py."""
+    monkeypatch.setenv("DHTORCH_OPS", "0")
+    monkeypatch.setattr(loader, "_loaded", [])
+    contiguous = public_results()
+    for layout in VIEWS:
+        assert differing_entries(public_results(layout), contiguous) == [], layout
