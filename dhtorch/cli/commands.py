@@ -136,7 +136,7 @@ COMMANDS: dict[str, Command] = {
         "depth and sigma for every pixel of every frame, as PNG files",
         "PATH --out DIR",
         "Completes the depth of every frame from the sensor and other views. Writes depth/, sigma/ and "
-        "source/ (0 none, 1 sensor, 3 swept, 5 filled) as PNG, meta/ as JSON (units, camera, source views, "
+        "source/ (0 none, 1 sensor, 2 and 3 recovered, 5 filled) as PNG, meta/ as JSON (units, camera, source views, "
         "reasons for no answer). 0 is no depth. DIR is a recording again where the capture's format, or "
         "numbered frames, can hold it.",
         (

@@ -89,10 +89,8 @@ def _side_by_side(
         canvas.dots(inside, Stroke(INK, 1.5))
         if metre is not None:
             _scale_bar(canvas, left, width, metre * scale)
-    keys = [
-        LegendKey(f"{words(names(Source)[code])}  {n}", colours.SOURCE_COLOURS[code], "box")
-        for code, n in counts.items()
-    ]
+    labels = {code: words(name) for code, name in names(Source).items()} | {Source.SWEPT: "recovered (swept)"}
+    keys = [LegendKey(f"{labels[code]}  {n}", colours.SOURCE_COLOURS[code], "box") for code, n in counts.items()]
     save_figure(canvas.finished(keys), path)
 
 

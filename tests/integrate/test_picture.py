@@ -223,7 +223,7 @@ def strokes(monkeypatch):
 def test_two_pictures_lie_side_by_side_with_path_scale_and_legend(strokes):
     pictures = {"one": np.zeros((150, 200, 3)), "two": np.ones((150, 200, 3))}
     path = np.array([[0.0, 0.0], [99.5, 74.5], [500.0, 10.0], [10.0, -5.0]])
-    picture._side_by_side("a.png", pictures, path, {Source.SENSOR: 7, Source.RECOVERED: 9}, 20.0)
+    picture._side_by_side("a.png", pictures, path, {Source.SENSOR: 7, Source.SWEPT: 9, Source.FILLED: 3}, 20.0)
     ((canvas, file),) = strokes
     scale = 346 / 200
     height = 150 * scale
@@ -246,7 +246,8 @@ def test_two_pictures_lie_side_by_side_with_path_scale_and_legend(strokes):
         assert canvas.texts[k] == ("2 m", left + 6, 11)
     assert [(key.text, key.colour) for key in canvas.keys] == [
         ("sensor  7", SOURCE_COLOURS[Source.SENSOR]),
-        ("recovered  9", SOURCE_COLOURS[Source.RECOVERED]),
+        ("recovered (swept)  9", SOURCE_COLOURS[Source.SWEPT]),
+        ("filled  3", SOURCE_COLOURS[Source.FILLED]),
     ]
 
 
