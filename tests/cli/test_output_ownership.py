@@ -294,9 +294,10 @@ def test_two_at_once_with_different_options_do_not_mix(capture, tmp_path):
     first = _command(words, tmp_path)
     _wait_for(out / PRIVATE_FOLDER / "lock", first)
     second = _command([*words, "seed=7"], tmp_path)
-    line = second.communicate(timeout=200)[1].strip()
+    lines = second.communicate(timeout=200)[1].strip().splitlines()
+    (line,) = [line for line in lines if "depth unit assumed" not in line]  # where the first ends before the second reads
     assert first.wait(200) == 0 and second.returncode == run.EXIT_FAILED
-    assert str(out) in line and len(line.splitlines()) == 1 and ("dhtorch process" in line or "seed" in line)
+    assert str(out) in line and ("dhtorch process" in line or "seed" in line)
     keys = {json.loads(path.read_text())["key"] for path in (out / "meta").iterdir()}
     assert len(keys) == 1 and len(data.open(out)) == 4
     first.stderr.close()
