@@ -295,9 +295,7 @@ def test_two_at_once_with_different_options_do_not_mix(capture, tmp_path):
     _wait_for(out / PRIVATE_FOLDER / "lock", first)
     second = _command([*words, "seed=7"], tmp_path)
     lines = second.communicate(timeout=200)[1].strip().splitlines()
-    (line,) = [
-        line for line in lines if "depth unit assumed" not in line
-    ]  # where the first ends before the second reads
+    (line,) = [s for s in lines if "depth unit assumed" not in s]  # said where the first ends before the second reads
     assert first.wait(200) == 0 and second.returncode == run.EXIT_FAILED
     assert str(out) in line and ("dhtorch process" in line or "seed" in line)
     keys = {json.loads(path.read_text())["key"] for path in (out / "meta").iterdir()}

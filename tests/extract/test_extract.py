@@ -233,7 +233,7 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
     )
     before = seen(files("features"))
     assert len(before) == 1
-    with pytest.raises(data.FormatError, match="found 1, expected 3: the same dhtorch extract once more"):
+    with pytest.raises(data.FormatError, match="found 1, expected 3: run the same dhtorch extract again"):
         FeatureTable("features")
     code, out, _ = command(*asked(robot))
     assert code == 0 and "3 shards (1 left untouched)" in out
