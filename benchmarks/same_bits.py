@@ -671,7 +671,7 @@ def run(checkout: Path, mode: str, path: Path, options: argparse.Namespace) -> N
 
 
 def state(checkout: Path) -> str:
-    """What tells the code of a checkout from another: its commit, or path, sizes and times where it has changes."""
+    """What tells the code of a checkout from another: its commit, or paths and contents where it has changes."""
     if shutil.which("git"):
         git = ["git", "--no-optional-locks", "-C", str(checkout)]
         commit, changes = (
@@ -681,8 +681,8 @@ def state(checkout: Path) -> str:
         if commit.returncode == 0 and changes.returncode == 0 and not changes.stdout.strip():
             return commit.stdout.strip()
     files = sorted(path for part in ("dhtorch", "conf") for path in (checkout / part).rglob("*") if path.is_file())
-    stats = [(str(path), path.stat()) for path in files if "__pycache__" not in path.parts]
-    return "\n".join(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats)
+    sources = [path for path in files if "__pycache__" not in path.parts]
+    return "\n".join(f"{path} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in sources)
 
 
 def cache_key(checkout: Path, mode: str, options: argparse.Namespace) -> str:

@@ -36,8 +36,7 @@ def standard_numerics(function: Callable[_P, _T]) -> Callable[_P, _T]:
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
         with _standard_defaults():
-            values, options = [_contiguous(x) for x in args], {name: _contiguous(x) for name, x in kwargs.items()}
-            return function(*values, **options)  # type: ignore[arg-type]
+            return function(*map(_contiguous, args), **{name: _contiguous(x) for name, x in kwargs.items()})
 
     return wrapped
 
