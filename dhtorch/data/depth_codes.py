@@ -34,9 +34,9 @@ def metres_by_code(info: Mapping[str, Any], key: str, file: Path) -> np.ndarray:
     """
     numbers = [info.get(f"video.{name}", info.get(name, default)) for name, default in DEFAULT_RANGE.items()]
     log = info.get("video.use_log", info.get("use_log", True))
-    are_numbers = all(isinstance(x, int | float) for x in numbers)
+    are_numbers = all(isinstance(x, int | float) and abs(x) <= 1e4 for x in numbers)
     low, high, shift = numbers if are_numbers else (0.0, 0.0, 0.0)
-    if not 0 <= low < high <= 1e4 or (log and not 1e-6 < low + shift <= 1e4):  # only the logarithm needs a shift
+    if not 0 <= low < high or (log and low + shift <= 1e-6):  # only the logarithm needs a shift
         raise FormatError(file, f"{key} {', '.join(DEFAULT_RANGE)}", numbers, "a range of metres")
     fraction = np.arange(N_CODES) / (N_CODES - 1)
     if log:
