@@ -584,7 +584,13 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
         for _ in "ab"
     ]
     swept = SweptPointCloud(
-        clouds[0].xyz + 5, clouds[1].rgb, columns["sigma"] + 1, columns["score"], 2.0, columns["cause"]
+        clouds[0].xyz + 5,
+        clouds[1].rgb,
+        columns["sigma"] + 1,
+        columns["score"],
+        3 + 2 * columns["tracked"],
+        2.0,
+        columns["cause"],
     )
     shot = PairExhibit(
         "a pair",
@@ -628,6 +634,7 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
     same(unpack(sent["swept"]["sigma"]), swept.sigma)
     same(unpack(sent["swept"]["score"]) / 65535, swept.score, 1e-5)
     same(unpack(sent["swept"]["cause"]), columns["cause"])
+    same(unpack(sent["swept"]["source"]), 3 + 2 * columns["tracked"])
     assert sent["swept"]["step_px"] == 2.0
 
 
