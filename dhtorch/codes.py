@@ -217,6 +217,10 @@ class PinReason(CodeTable):
     NO_AGREEMENT: Final = code(2, "what was found does not move as one: little background, or another scene")
     ONE_PLACE: Final = code(3, "what agrees lies in one part of the picture")
     UNCERTAIN: Final = code(4, "the shift is not known to a pixel")
+    ZOOM: Final = code(5, "zoom or focus changed: another focal length explains the picture better than a motion")
+    ZOOM_OR_MOTION: Final = code(
+        6, "moved along the axis, or zoom or focus changed: the depths in view do not tell which"
+    )
 
 
 class WrongCause(CodeTable):

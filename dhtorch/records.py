@@ -391,6 +391,8 @@ class PinResult(Record):
     agreement: Tensor  # (B,) fraction of the tracks that agree
     coverage: Tensor  # (B,) fraction of the reference's groups of places with agreeing tracks
     false_alarm_rate: Tensor  # (B,) stated for "moved" of a camera that stands still
+    zoom: Tensor  # (B,) focal length over the stated one, fitted with the motion; NaN where it is not known
+    zoom_sigma: Tensor  # (B,) its standard deviation
 
     @property
     def offset(self) -> Tensor:

@@ -255,6 +255,8 @@ def _row_of(episode: Episode) -> dict[str, Any]:
             "frame": episode.numbers[k],
             "verdict": name(PinVerdict, int(result.verdict[k])).lower(),
             "reason": name(PinReason, int(result.reason[k])).lower(),
+            "zoom": float(result.zoom[k]),
+            "zoom_sigma": float(result.zoom_sigma[k]),
             "shift_px": float(result.shift_px[k]),
             "shift_sigma_px": float(result.shift_sigma_px[k]),
             "rotation_deg": (result.offset[k, :3] * (180 / math.pi)).tolist(),
@@ -302,6 +304,8 @@ def _write_pages(
         middle, largest = episode.middle, episode.result.shift_px.nan_to_num(-math.inf).max()
         numbers = torch.stack([middle.shift_px[0], middle.shift_sigma_px[0], largest]).tolist()
         verdict = name(PinVerdict, episode.verdict).lower().replace("_", " ")
+        if episode.verdict == PinVerdict.CANNOT_KNOW:
+            verdict += f": {PinReason.entries[int(middle.reason)].definition}"
         cells = [verdict, *(f"{x:.2f}" if math.isfinite(x) else "–" for x in numbers), str(len(episode.changes))]
         after = encode_png(_to_rgb(episode.worst)) if rank < settings["pictures"] else None
         shown.append(PinnedEpisode(episode.name, cells, before if after else None, after))

@@ -21,7 +21,9 @@ def describe_pin(result: PinResult) -> str:
     """One picture's result (1) in a line: verdict, shift, offset with standard deviations, or the reason for none."""
     verdict = name(PinVerdict, int(result.verdict)).lower().replace("_", " ")
     if int(result.verdict) == PinVerdict.CANNOT_KNOW:
-        return f"{verdict}: {PinReason.entries[int(result.reason)].definition}"
+        text = f"{verdict}: {PinReason.entries[int(result.reason)].definition}"
+        focal = f" ({float(result.zoom):.4f} ± {float(result.zoom_sigma):.4f} of the stated one)"
+        return text + focal if int(result.reason) == PinReason.ZOOM else text
     sigma = result.cov[0].diagonal().clamp_min(0).sqrt()
     turn, shift = result.offset[0].split(3)
     angle = math.degrees(float(turn.norm()))

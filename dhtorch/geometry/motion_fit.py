@@ -69,12 +69,15 @@ class MotionFit(NamedTuple):
     """Result of :func:`fit_motion`."""
 
     T: Pose  # live from reference
-    cov: Tensor  # (B, 6, 6) of the left perturbation
+    log_zoom: Tensor  # (B,) logarithm of the focal length over the stated one; 0 where it is not free
+    cov: Tensor  # (B, 7, 7) of the left perturbation and log_zoom, zero for what is not free
     inlier: Tensor  # (B, N) bool
     noise_px: Tensor  # (B,) standard deviation of a coordinate of an inlier
 
 
-def fit_motion(seen: Sightings, starts: Pose, group: Tensor, *, overlap: float, rotation_only: bool) -> MotionFit:
+def fit_motion(
+    seen: Sightings, starts: Pose, group: Tensor, *, overlap: float, rotation_only: bool, zoom: bool = False
+) -> MotionFit:
     """The motion on which most tracks agree: reweighted least squares from several starts, the best of which is kept.
 
     Args:
@@ -83,45 +86,56 @@ def fit_motion(seen: Sightings, starts: Pose, group: Tensor, *, overlap: float, 
         group: (N,) long, groups of neighbours, whose errors are common.
         overlap: windows over an area, a count at least 1: so many tracks count as one in the model's covariance.
         rotation_only: the translation stays the start's, with zero covariance.
+        zoom: the focal length is also fitted, from the stated one.
 
     Returns:
         The fit; ``cov`` is the sandwich over the groups plus a share of the model's own.
     """
+    free = [0, 1, 2, *([] if rotation_only else [3, 4, 5]), *([6] if zoom else [])]
     many = Sightings(*(x.expand(len(starts.t), *x.shape[1:]) for x in seen))
-    T = starts
+    state = starts, torch.zeros_like(starts.t[:, 0])
     for bend in FIT_BENDS_PX:
-        T, _ = _step(many, T, bend, rotation_only)
-    best = int(_step(many, T, FIT_BENDS_PX[-1], rotation_only)[1].argmin())
-    T = T[best : best + 1]
+        *state, _ = _step(many, *state, bend, free)
+    best = int(_step(many, *state, FIT_BENDS_PX[-1], free)[2].argmin())
+    T, log_zoom = (x[best : best + 1] for x in state)
     for _ in range(FINAL_STEPS):
-        r, depth = reprojection_residuals(T, seen.f, seen.c, seen.xyz, seen.uv)
-        T, _ = _step(seen, T, FINAL_BEND * _noise(r, seen.used & (depth > MIN_DEPTH))[:, None], rotation_only)
-    rows, depth = linearise(T, seen.f, seen.c, seen.xyz, seen.uv)
+        rows, depth = _linearise(seen, T, log_zoom)
+        T, log_zoom, _ = _step(
+            seen, T, log_zoom, FINAL_BEND * _noise(rows[:, -1], seen.used & (depth > MIN_DEPTH))[:, None], free
+        )
+    rows, depth = _linearise(seen, T, log_zoom)
     usable = seen.used & (depth > MIN_DEPTH)
-    noise = _noise(rows[:, 6], usable)
-    square = rows[:, 6].square().sum(1)
+    noise = _noise(rows[:, -1], usable)
+    square = rows[:, -1].square().sum(1)
     inlier = usable & (square < (AGREEING_SIGMAS * noise[:, None]) ** 2)
     _, weight = robust_loss(square / (FINAL_BEND * noise[:, None]) ** 2, "geman_mcclure", 1.0)
-    rows, sigma = _free(rows, rotation_only), noise * (MODEL_SHARE * overlap) ** 0.5
-    cov = grouped_covariance(rows, torch.where(usable, weight, 0.0), inlier, group, sigma)
-    zeros = (0, 6 - cov.shape[-1])
-    return MotionFit(T, F.pad(cov, zeros + zeros), inlier, noise)
+    rows, sigma = rows[:, [*free, 7]], noise * (MODEL_SHARE * overlap) ** 0.5
+    cov = rows.new_zeros(len(rows), 7, 7)
+    cov[:, torch.tensor(free)[:, None], free] = grouped_covariance(
+        rows, torch.where(usable, weight, 0.0), inlier, group, sigma
+    )
+    return MotionFit(T, log_zoom, cov, inlier, noise)
 
 
-def _step(seen: Sightings, T: Pose, bend: Tensor | float, rotation_only: bool) -> tuple[Pose, Tensor]:
-    """One reweighted Gauss-Newton step, and the sum (B,) of the robust cost before it."""
-    rows, depth = linearise(T, seen.f, seen.c, seen.xyz, seen.uv)
+def _linearise(seen: Sightings, T: Pose, log_zoom: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (B, 8, 2, N) of :func:`linearise` with the column of log_zoom before the residual, and depths (B, N)."""
+    rows, depth = linearise(T, seen.f * log_zoom.exp()[:, None], seen.c, seen.xyz, seen.uv)
+    zoom = rows[:, 6:] + (seen.uv - seen.c[..., None])[:, None]
+    return torch.cat((rows[:, :6], zoom, rows[:, 6:]), 1), depth
+
+
+def _step(
+    seen: Sightings, T: Pose, log_zoom: Tensor, bend: Tensor | float, free: list[int]
+) -> tuple[Pose, Tensor, Tensor]:
+    """One reweighted Gauss-Newton step of what is free, and the sum (B,) of the robust cost before it."""
+    rows, depth = _linearise(seen, T, log_zoom)
     usable = seen.used & (depth > MIN_DEPTH)
-    rho, weight = robust_loss(rows[:, 6].square().sum(1) / bend**2, "geman_mcclure", 1.0)
+    rho, weight = robust_loss(rows[:, -1].square().sum(1) / bend**2, "geman_mcclure", 1.0)
     cost = torch.where(usable, rho, 1.0).sum(-1)
-    H, g = normal_equations(_free(rows, rotation_only), torch.where(usable, weight, 0.0))
-    xi = solve_spd(H, -g[..., None])[0][..., 0]
-    return move_pose(T, F.pad(xi, (0, 6 - xi.shape[-1]))), cost
-
-
-def _free(rows: Tensor, rotation_only: bool) -> Tensor:
-    """Rows of a linearisation without the columns of what stays as it is."""
-    return torch.cat((rows[:, :3], rows[:, 6:]), 1) if rotation_only else rows
+    H, g = normal_equations(rows[:, [*free, 7]], torch.where(usable, weight, 0.0))
+    xi = rows.new_zeros(len(rows), 7)
+    xi[:, free] = solve_spd(H, -g[..., None])[0][..., 0]
+    return move_pose(T, xi[:, :6]), log_zoom + xi[:, 6], cost
 
 
 def _noise(r: Tensor, usable: Tensor) -> Tensor:
@@ -157,6 +171,8 @@ def scene_flow(
 
 
 def mean_flow_form(xyz: Tensor, known: Tensor, f: Tensor, c: Tensor) -> Tensor:
-    """Mean of J^T J (B, 6, 6) over known points (B, 3, N) seen from the reference: px² per squared unit of a motion."""
-    rows, _ = linearise(se3.identity(len(f), f), f, c, xyz, torch.zeros_like(xyz[:, :2]))
+    """Mean of J^T J (B, 7, 7) over known points (B, 3, N) seen from the reference: px² per squared unit of a motion and
+    of the logarithm of the focal length."""
+    here = Sightings(xyz, torch.zeros_like(xyz[:, :2]), known, f, c)
+    rows, _ = _linearise(here, se3.identity(len(f), f), torch.zeros_like(f[:, 0]))
     return normal_equations(rows, known.to(f.dtype))[0] / known.sum(-1).clamp_min(1)[:, None, None]

@@ -175,6 +175,8 @@ class CameraPin:
         self.points = xyz if self.metric else self.ray  # (1, 3, N)
         f, c = frame.camera.f.double(), frame.camera.c.double()
         self.flow_form = motion_fit.mean_flow_form(self.points, self.known, f, c)
+        self.free = 6 if self.metric else 3  # components of an offset
+        self.sway = STILL_SWAY_PX**2 * torch.linalg.inv(self.flow_form[:, : self.free, : self.free])
         spacing = frame.hw[0] / rows, frame.hw[1] / columns
         self.overlap = max(1.0, PIN_WINDOW_PX / spacing[0]) * max(1.0, PIN_WINDOW_PX / spacing[1])
         column, row = cam.resize_pixels(self.places.uv[0], frame.hw, PIN_GROUPS).round().long().unbind(-1)
@@ -244,15 +246,14 @@ class CameraPin:
             starts.append(select_batch(searched.ok, searched.T_1_from_0.map(lambda x: x.double()), still))
         return tracks, seen, self._fit(seen, collate(starts))
 
-    def _fit(self, seen: Sightings, starts: Pose) -> MotionFit:
-        rotation_only = not self.metric
-        return motion_fit.fit_motion(seen, starts, self.group, overlap=self.overlap, rotation_only=rotation_only)
+    def _fit(self, seen: Sightings, starts: Pose, *, zoom: bool = False) -> MotionFit:
+        options = {"overlap": self.overlap, "rotation_only": not self.metric, "zoom": zoom}
+        return motion_fit.fit_motion(seen, starts, self.group, **options)
 
     def _conclude(self, fit: MotionFit, seen: Sightings) -> PinResult:
         """The offset of a fit with its shift, and the verdict."""
-        T, cov, used, inlier, noise = fit.T, fit.cov, seen.used, fit.inlier, fit.noise_px
+        T, cov, used, inlier, noise = fit.T, fit.cov[:, :6, :6], seen.used, fit.inlier, fit.noise_px
         shift, sigma = motion_fit.scene_flow(T, cov, seen.xyz, self.known, (seen.f, seen.c))
-        free = 6 if self.metric else 3
         translates = torch.zeros_like(used[:, 0])
         if self.metric:
             scale = COMMON_DEPTH_ERROR * torch.cat((torch.zeros_like(T.t), T.t), -1)
@@ -266,9 +267,15 @@ class CameraPin:
             shift = torch.where(translates, masked_median(flow, on_line)[:, 0], shift)
             sigma, noise = torch.where(translates, epipolar, sigma), torch.where(translates, epipolar, noise)
             inlier = torch.where(translates[:, None], on_line, inlier)
-        sway = STILL_SWAY_PX**2 * torch.linalg.inv(self.flow_form[:, :free, :free])
-        distance = mahalanobis(se3.log(fit.T)[:, :free], cov[:, :free, :free] + sway)
-        limit = chi2_quantile(1 - self.false_alarm_rate, free) ** 0.5
+        joint = self._fit(seen, collate([fit.T, se3.identity(1, seen.f)]), zoom=True)
+        is_flat = joint.cov[:, 6, 6] == 0  # all depths are equal: singular
+        joint = select_batch(is_flat, fit, joint)
+        zoomed, unclear = self._tell_zoom(joint, translates & (joint.noise_px <= MIN_PARALLAX_RATIO * sigma))
+        noise = torch.where(zoomed, joint.noise_px, noise)
+        inlier = torch.where(zoomed[:, None], joint.inlier, inlier)
+        free = self.free
+        distance = mahalanobis(se3.log(fit.T)[:, :free], cov[:, :free, :free] + self.sway)
+        moved = (distance > chi2_quantile(1 - self.false_alarm_rate, free) ** 0.5) | translates
         groups = F.one_hot(self.group).float()  # (N, groups)
         agreeing, placed = ((x.float() @ groups > 0).sum(-1) for x in (inlier, self.known))
         coverage = agreeing / placed.clamp_min(1)
@@ -278,10 +285,14 @@ class CameraPin:
             ((inlier.sum(-1) < MIN_PIN_INLIERS) | (agreement < MIN_PIN_AGREEMENT), PinReason.NO_AGREEMENT),
             (noise > MAX_PIN_NOISE_PX, PinReason.NO_AGREEMENT),
             (agreeing < MIN_PIN_GROUPS, PinReason.ONE_PLACE),
+            (zoomed, PinReason.ZOOM),
             (~(sigma <= MAX_PIN_SIGMA_PX), PinReason.UNCERTAIN),
+            (unclear & moved, PinReason.ZOOM_OR_MOTION),
         )
         answered = reason == PinReason.ANSWERED
-        verdict = torch.where((distance > limit) | translates, PinVerdict.MOVED, PinVerdict.NOT_MOVED)
+        has_zoom = (answered & self.metric) | (reason == PinReason.ZOOM) | (reason == PinReason.ZOOM_OR_MOTION)
+        zoom = torch.where(has_zoom & ~is_flat, joint.log_zoom.exp(), torch.nan)
+        verdict = torch.where(moved, PinVerdict.MOVED, PinVerdict.NOT_MOVED)
         verdict = torch.where(answered, verdict, PinVerdict.CANNOT_KNOW).int()
         T_ref = se3.invert(T)
         A = se3.adjoint(T_ref)
@@ -301,12 +312,39 @@ class CameraPin:
             verdict=verdict,
             reason=reason,
             metric=torch.full_like(answered, self.metric),
-            flow_form=self.flow_form,
+            flow_form=self.flow_form[:, :6, :6],
             inlier=inlier & answered[:, None],
             agreement=agreement,
             coverage=coverage,
             false_alarm_rate=torch.full_like(shift, self.false_alarm_rate),
+            zoom=zoom,
+            zoom_sigma=zoom * joint.cov[:, 6, 6].sqrt(),
         )
+
+    def _tell_zoom(self, joint: MotionFit, is_radial: Tensor) -> tuple[Tensor, Tensor]:
+        """Fit (1) of motion and focal length -> whether another focal length explains the tracks better than a
+        translation, and whether either would: (1) bool each.
+
+        Squared Mahalanobis lengths are what chi-squared rises by where the translation, or the change of focal length,
+        is left out; the rotation is free in both. ``is_radial`` (1) bool, without depth: rotation and focal length
+        explain what counts as a translation else; a motion towards a wall would, too.
+        """
+        x = torch.cat((se3.log(joint.T), joint.log_zoom[:, None]), -1)
+        cov = joint.cov.clone()
+        cov[:, : self.free, : self.free] += self.sway
+        cov[:, 6, 6] += STILL_SWAY_PX**2 / self.flow_form[:, 6, 6]
+
+        def rise(first: int, last: int) -> tuple[Tensor, Tensor]:
+            square = mahalanobis(x[:, first:last], cov[:, first:last, first:last]) ** 2
+            return square, square > chi2_quantile(1 - self.false_alarm_rate, last - first)
+
+        focal, needs_focal = rise(6, 7)
+        if not self.metric:
+            return torch.zeros_like(is_radial), is_radial & needs_focal
+        shift, needs_shift = rise(3, 6)
+        _, changed = rise(3, 7)
+        unclear = torch.where(joint.cov[:, 6, 6] > 0, changed & ~needs_focal & ~needs_shift, needs_shift)
+        return changed & needs_focal & (focal > shift), unclear
 
 
 #: The tracker: pyramids, then windows with affine motion, gain and bias.

@@ -53,6 +53,23 @@ def test_a_picture_within_the_limit_passes_and_the_guide_says_the_way(tmp_path, 
     assert "direction" in found["episodes"][0]["pictures"][0]
 
 
+def test_another_zoom_is_cannot_know_and_counts_as_unknown(tmp_path, capture, capsys):
+    root, frames = capture
+    image = frames[1].image.float()
+    scale = torch.tensor([[[1 / 1.04, 0.0, 0.0], [0.0, 1 / 1.04, 0.0]]])
+    grid = torch.nn.functional.affine_grid(scale, image.shape, align_corners=False)
+    zoomed = torch.nn.functional.grid_sample(image, grid, mode="bicubic", align_corners=False).clamp(0, 255).byte()
+    (tmp_path / "zoomed.png").write_bytes(encode_png(zoomed[0].permute(1, 2, 0).numpy()))
+    code, found = pinned(tmp_path / "a", root, tmp_path / "zoomed.png", "fail_on=moved>2px")
+    (row,) = found["episodes"][0]["pictures"]
+    assert code == run.EXIT_DONE and row["verdict"] == "cannot_know" and row["reason"] == "zoom"
+    assert row["zoom"] == pytest.approx(1.04, abs=0.003) and 0 < row["zoom_sigma"] < 0.002
+    assert "cannot know: zoom or focus changed" in capsys.readouterr().out
+    assert "zoom or focus changed" in (tmp_path / "a" / "pin.html").read_text()
+    code, found = pinned(tmp_path / "b", root, tmp_path / "zoomed.png", "fail_on=unknown>0.5")
+    assert code == run.EXIT_SOME_FAILED
+
+
 def test_a_live_camera_is_watched_until_its_end(tmp_path, capture, capsys, monkeypatch):
     root, frames = capture
     pictures = [np.ascontiguousarray(frame.image[0].permute(1, 2, 0).numpy()[..., ::-1]) for frame in frames[3:6]]

@@ -117,6 +117,36 @@ def test_without_depth_the_rotation_is_known_and_the_translation_up_to_scale():
     assert float(ahead.T_ref_from_live.t[0, 2]) == pytest.approx(1, abs=0.02)
 
 
+@cache
+def zoomed(factor):
+    """Picture of the camera that stands still, with another focal length."""
+    lens = LitRoom(seed=3, n_frames=1, hw=(120, 160), supersample=2, true_poses=room().true_poses[:1])
+    lens.camera = lens.camera.replace(f=factor * lens.camera.f)
+    return lens[0].image
+
+
+@pytest.mark.parametrize("factor", [0.96, 0.98, 1.02, 1.04])
+def test_another_focal_length_is_no_motion(factor):
+    result = pinned().check(zoomed(factor))
+    assert not bool(result.moved) and int(result.reason) == PinReason.ZOOM and bool(result.offset.isnan().all())
+    assert float(result.zoom) == pytest.approx(factor, abs=max(0.001, 4 * float(result.zoom_sigma)))
+    assert "zoom or focus changed" in describe_pin(result) and f"({factor:.2f}" in describe_pin(result)
+
+
+def test_a_motion_along_the_axis_is_no_zoom():
+    result = pinned().check(room()[4].image)
+    assert bool(result.moved) and float(result.T_ref_from_live.t[0, 2]) == pytest.approx(0.04, abs=0.002)
+    assert float(result.zoom) == pytest.approx(1, abs=0.002)
+
+
+@pytest.mark.parametrize("depth", [0.0, 1.5])
+def test_without_differences_of_depth_a_zoom_may_be_a_motion(depth):
+    frame = room()[0]
+    result = CameraPin(frame.replace(depth=torch.full_like(frame.depth, depth))).check(zoomed(1.02))
+    assert int(result.verdict) == PinVerdict.CANNOT_KNOW and int(result.reason) == PinReason.ZOOM_OR_MOTION
+    assert "moved along the axis, or zoom or focus changed" in describe_pin(result)
+
+
 def test_a_capture_as_reference_leaves_out_what_moves():
     frames = [hide_behind_arms(room()[0], 0.15, arm_seed=0, draw=random.Random(k))[0] for k in range(5)]
     clean = room()[0].image.float()
@@ -181,6 +211,8 @@ def series(offsets, sigma_px=0.05):
         agreement=one,
         coverage=one,
         false_alarm_rate=0.01 * one,
+        zoom=one,
+        zoom_sigma=0 * one,
     )
 
 

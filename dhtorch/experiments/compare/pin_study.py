@@ -44,6 +44,10 @@ SHIFTS_PX = ((0.5, 2.0, 20.0), (1.0, 2.0, 5.0, 60.0))
 #: Planted turns about a random axis, degrees, likewise.
 TURNS_DEG = ((0.1, 1.0, 5.0), (0.5, 2.0))
 
+#: Planted motions along the axis, m, and changes of the focal length, a fraction, likewise.
+AHEAD_M = ((0.005, 0.02, -0.05), (0.01, 0.05, 0.1))
+FOCAL_CHANGES = ((-0.02, 0.01, 0.04), (-0.04, -0.01, 0.02))
+
 #: Frames of the walk through a room, at one of which the camera is fixed.
 _WALK_FRAMES = 60
 
@@ -84,6 +88,7 @@ PIN_EXPECTATION = "Every number of the list of bars is met; scenes are the unit 
 PIN_BARS: dict[str, tuple[float, float]] = {
     "pin.found_2px": (0.95, 1.0),
     "pin.false_alarms": (0.0, 0.01),
+    "pin.zoom_moved": (0.0, 0.01),
     "pin.error_mm_half": (0.0, 2.0),
     "pin.error_deg_half": (0.0, 0.1),
     "pin.within_1sigma_half": (0.61, 0.75),
@@ -98,7 +103,7 @@ PIN_BARS: dict[str, tuple[float, float]] = {
 class PlantedMove:
     """One rendered picture of a fixed camera."""
 
-    kind: str  # "shift" (px), "turn" (degrees) or "still"
+    kind: str  # "shift" (px), "turn" (degrees), "ahead" (m), "zoom" (fraction) or "still"
     size: float
     light: str
     T_ref_from_live: Pose
@@ -129,7 +134,8 @@ def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int 
     options: dict[str, Any] = {"seed": seed, "hw": hw, "supersample": supersample}
     still = LitRoom(n_frames=1, true_poses=here, **options)
     depth = still.truth(0)["depth"]
-    wanted = [("shift", size) for size in SHIFTS_PX[seed % 2]] + [("turn", size) for size in TURNS_DEG[seed % 2]]
+    sizes = {"shift": SHIFTS_PX, "turn": TURNS_DEG, "ahead": AHEAD_M}
+    wanted = [(name, size) for name, of in sizes.items() for size in of[seed % 2]]
     moves = [(name, size, _draw_move(name, size, depth, still.camera, draw)) for name, size in wanted]
     moves = [("still", 0.0, se3.identity(1, here.t)), *moves]
     pictures = []
@@ -138,13 +144,19 @@ def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int 
         poses = collate(se3.compose(here, T) for _, _, T in mine)
         room = LitRoom(light=light, n_frames=len(mine), true_poses=poses, **options)
         pictures += [PlantedMove(name, size, light, T, room[i]) for i, (name, size, T) in enumerate(mine)]
+        lens = LitRoom(light=light, n_frames=1, true_poses=here, **options)
+        lens.camera = lens.camera.replace(f=lens.camera.f * (1 + (zoom := FOCAL_CHANGES[seed % 2][k])))
+        pictures.append(PlantedMove("zoom", zoom, light, moves[0][2], lens[0]))
     return FixedScene(f"{kind}_{seed}", pictures[0].frame, tuple(pictures))
 
 
 def _draw_move(kind: str, size: float, depth: Tensor, camera: Camera, draw: Random) -> Pose:
-    """A random motion ``T_ref_from_live`` (1), float64: of ``size`` px at the median point of the scene, or degrees."""
+    """A motion ``T_ref_from_live`` (1), float64: random, of ``size`` px at the median point of the scene or degrees, or
+    along the axis, m."""
     turn, shift = (torch.tensor([draw.gauss(0, 1) for _ in range(3)], dtype=torch.float64) for _ in range(2))
     turn, shift = turn / turn.norm(), shift / shift.norm()
+    if kind == "ahead":
+        return Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, size]], dtype=torch.float64))
     if kind == "turn":
         return se3.exp(torch.cat((turn * math.radians(size), 0 * shift))[None])
     share = draw.uniform(0.2, 0.8)
@@ -308,12 +320,13 @@ def summarise_pin(rows: Sequence[Row], times: Sequence[Mapping[str, float]]) -> 
             summary[f"pin.{key}"] = bootstrap.interval_over_scenes(shares, statistic="mean").entry("1")
 
     add_share("false_alarms", [row for row in planted if row["kind"] == "still"], "moved")
-    add_share("unknown", planted, "cannot_know")
-    for kind, unit in (("shift", "px"), ("turn", "deg")):
+    add_share("unknown", [row for row in planted if row["kind"] != "zoom"], "cannot_know")
+    add_share("zoom_moved", [row for row in planted if row["kind"] == "zoom"], "moved")
+    for kind, unit in (("shift", "px"), ("turn", "deg"), ("ahead", "m")):
         for size in sorted({row["size"] for row in planted if row["kind"] == kind}):
             chosen = [row for row in planted if (row["kind"], row["size"]) == (kind, size)]
             add_share(f"found_{size:g}{unit}", chosen, "moved")
-    moved = [row for row in planted if row["kind"] != "still" and "sigmas" in row]
+    moved = [row for row in planted if row["kind"] in ("shift", "turn", "ahead") and "sigmas" in row]
     for suffix, chosen in (("half", [row for row in moved if row["hidden"] == 0.5]), ("all", moved)):
         if chosen:
             sigmas = torch.tensor([row["sigmas"] for row in chosen]).abs()
