@@ -531,7 +531,7 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.{name}" for name in ("motion_fit.scene_flow", "epipolar_motion.fit_epipolar_motion")),
     *(f"dhtorch.geometry.covariance.{name}" for name in ("chi2_quantile", "grouped_covariance")),
     *(f"dhtorch.metrics.change_points.{name}" for name in ("mean_changes", "median_of_three")),
-    *(f"dhtorch.metrics.camera_paths.{name}" for name in ("align_camera_paths", "scale_of_camera_paths")),
+    *(f"dhtorch.metrics.camera_paths.{name}" for name in ("align_camera_paths", "compare_motions", "motions_of_path")),
     *(
         f"dhtorch.metrics.grouped.{name}"
         for name in ("covariance_of_mean", "grouped_slopes", "huber_mean", "mad_sigma", "mean_over_stretches")

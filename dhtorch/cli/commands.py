@@ -324,7 +324,8 @@ COMMANDS: dict[str, Command] = {
         "MODEL CAPTURE",
         "Measures the size of a reconstruction with the near returns of an RGB-D capture of the same scene, and "
         "writes the model in metres in its own format, scale.json and scale.html (scale by frame, picture region "
-        "and range). A model whose parts have different scales is refused, with where and how much.",
+        "and range). A model whose parts, or whose camera path and depths, have different scales is refused, with "
+        "where and how much.",
         (
             ("MODEL CAPTURE", "a COLMAP folder, transforms.json, npz files or a splat's PLY"),
             ("MODEL CAPTURE --sensor iphone_lidar", "with the accuracy of the capture's sensor"),

@@ -1,8 +1,8 @@
 """``dhtorch scale``: a reconstruction up to scale and an RGB-D capture of the same scene -> the model in metres.
 
 Writes ``scale.json``, ``scale.html`` (scale of every frame, picture region and range) and, unless the model is
-refused, the files of the model with all lengths in metres. A model whose parts have different scales is refused with
-exit code 1.
+refused, the files of the model with all lengths in metres. A model whose parts, or whose camera path and depths, have
+different scales is refused with exit code 1.
 """
 
 from __future__ import annotations
@@ -85,6 +85,7 @@ def _check_options(settings: Mapping[str, Any]) -> None:
 def describe_scale(result: ScaleResult) -> dict[str, Any]:
     """Result -> what ``scale.json`` holds."""
     low, high = result.interval()
+    path = result.path
     rows = zip(result.names, result.matches, result.frame_log, result.frame_sigma, strict=True)
     return {
         "refused": not result.ok,
@@ -92,7 +93,13 @@ def describe_scale(result: ScaleResult) -> dict[str, Any]:
         "U": {"k": 2, "low": low, "high": high},
         "sigma": {"relative": result.sigma, **result.terms},
         "similarity": None if result.R is None else {"R": result.R, "t": result.t, "cov": result.cov},
-        "trajectory_scale": result.trajectory_scale,
+        "path": path
+        and {
+            "by": path.source,
+            "scale": path.scale,
+            "sigma": path.sigma,
+            "changes": [_describe_fault(change) for change in path.changes],
+        },
         "faults": [_describe_fault(fault) for fault in result.faults],
         "gradients": [_describe_fault(gradient) for gradient in result.gradients],
         "ranges": [dict(zip(("from", "to", "difference", "n"), row, strict=True)) for row in result.by_range],
@@ -135,10 +142,15 @@ def _format_lines(root: Path, result: ScaleResult) -> list[str]:
         lines += [f"  {fault}" for fault in _distinct(result.faults)]
         return [*lines, "  a sensor that is itself off at places looks the same: --tolerance accepts changes up to it"]
     lines += [f"{_model_name(root)}: 1 unit = {result.scale:.6g} m ± {half:.1%} (k = 2; {n} views; sigma: {terms})"]
-    if result.trajectory_scale is not None:
-        scale, sigma = result.trajectory_scale
-        lines += [f"  by the cameras' paths alone: {scale:.6g} m (scatter {sigma:.1%})"]
-    return lines
+    return [*lines, *(f"  {line}" for line in _describe_path(result))]
+
+
+def _describe_path(result: ScaleResult) -> list[str]:
+    """The size by the camera path in a line; none where it is not known."""
+    path = result.path
+    if path is None:
+        return []
+    return [f"by the camera path alone: {path.scale:.6g} m ± {2 * path.sigma:.1%} (k = 2; {path.source})"]
 
 
 def _distinct(faults: list[Any], most: int = 4) -> list[Any]:
@@ -151,7 +163,8 @@ def _distinct(faults: list[Any], most: int = 4) -> list[Any]:
 
 def _write_page(path: Path, name: str, result: ScaleResult) -> None:
     low, high = result.interval()
-    sentences = [f"1 unit of the model is {result.scale:.6g} m, from {low:.6g} to {high:.6g} m (k = 2).", *result.notes]
+    sentences = [f"1 unit of the model is {result.scale:.6g} m, from {low:.6g} to {high:.6g} m (k = 2)."]
+    sentences += [*_describe_path(result), *result.notes]
     order = np.argsort(-np.abs(np.nan_to_num(result.frame_log - np.log(result.scale))))
     frames = []
     for k in order:

@@ -32,6 +32,10 @@ SHARED_NOISE = 0.004
 #: Least standard deviation of a local scale in a contrast, as a log ratio. Source: chosen on: room 300 of scale_study.
 LEAST_SIGMA = 0.01
 
+#: Deviation of a frame's scale, in standard deviations of the frames, from which it is one of a part of its own.
+#: Source: as ``ScaleTolerance.scan_deviations``.
+OUTLIER_SIGMAS = 4.0
+
 #: Standard deviation of a median per that of a mean. Source: derived, sqrt(pi / 2).
 MEDIAN_LOSS = 1.2533
 
@@ -52,13 +56,18 @@ class LocalScales(NamedTuple):
 class ScaleFault:
     """A part of the model whose scale differs from that of the rest."""
 
-    kind: str  # drift | bend | frames | range | picture | region | place
+    kind: str  # drift | bend | frames | range | picture | region | place | path | curl | views
     where: str
-    change: float  # relative change of scale: between the ends of a gradient, or of the part to the rest
+    change: float  # relative change of scale: between the ends of a gradient, of part to rest, of path to depths
     sigma: float
 
     def __str__(self) -> str:
-        return f"{self.where}: scale changes by {self.change:+.1%} (sigma {self.sigma:.1%})"
+        effect = _EFFECTS.get(self.kind, "scale changes by")
+        return f"{self.where}: {effect} {self.change:+.1%} (sigma {self.sigma:.1%})"
+
+
+#: What a change of some kinds is, where it is none of the scale: a fraction of the path's length, and of the depth.
+_EFFECTS = {"curl": "the path's end moves by", "views": "off by at least"}
 
 
 @dataclass(frozen=True)
@@ -184,6 +193,12 @@ def _parts(local: LocalScales, names: list[str]) -> Iterator[tuple[str, str, np.
         for first in range(0, F - length + 1, max(1, length // 2)):
             last = first + length - 1
             yield "frames", f"frames {names[first]} to {names[last]}", (local.frame >= first) & (local.frame <= last)
+    of_frame = np.array([np.median(local.log[local.frame == f]) for f in np.unique(local.frame)])
+    off = of_frame - np.median(of_frame)
+    for far in (off, -off):
+        alone = np.unique(local.frame)[far > OUTLIER_SIGMAS * mad_sigma(off)]
+        listed = ", ".join(names[f] for f in alone[:3])
+        yield "frames", f"{len(alone)} of {F} frames, such as {listed}", np.isin(local.frame, alone)
     for region in np.unique(local.region):
         row, column = divmod(int(region), REGIONS[1])
         where = f"picture region row {row + 1} of {REGIONS[0]}, column {column + 1} of {REGIONS[1]}"

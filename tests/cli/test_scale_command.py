@@ -1,6 +1,7 @@
 """``dhtorch scale``: the model in metres beside the original, and a bent one refused with exit code 1."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +43,21 @@ def test_a_model_is_written_in_metres(capture, model, capsys):
     assert "1 unit = " in printed
     stored_outputs.check("scale", folder.parent, printed=printed.replace(str(capture), "CAPTURE"), folder=out)
     assert (out / "scale.html").read_text().count("data:image/png;base64,") == 3
+
+
+def test_a_model_whose_path_is_too_long_is_refused_with_where_and_how_much(capture, tmp_path, capsys):
+    content, _ = made.room_model("points")
+    c2w = np.stack([view.c2w for view in content.views])
+    c2w[:, :3, 3] += 0.1 * (c2w[:, :3, 3] - c2w[:, :3, 3].mean(0))
+    views = [replace(view, c2w=pose) for view, pose in zip(content.views, c2w, strict=True)]
+    made.write_colmap_text(tmp_path / "sparse", replace(content, views=views))
+    made.write_pictures(tmp_path / "images")
+    assert run.main(["scale", str(tmp_path / "sparse"), str(capture), "--cutoff", "2.5"]) == run.EXIT_SOME_FAILED
+    report = json.loads((tmp_path / "sparse_metres" / "scale.json").read_text())
+    (fault,) = [fault for fault in report["faults"] if fault["kind"] == "path"]
+    assert fault["change"] == pytest.approx(0.1, abs=2.5 * fault["sigma"])
+    assert report["path"]["by"] and report["path"]["scale"] < report["scale"]
+    assert "camera path against depths, by " in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Flag
+from dhtorch.geometry import se3
 from dhtorch.measure import ModelView, SceneModel, metric_scale, scale
 from dhtorch.measure.local_scales import REGIONS, LocalScales, ScaleTolerance, estimate_scale, find_faults, local_scales
 from dhtorch.stages.sample import regular_grid
@@ -63,7 +64,90 @@ def test_cameras_place_the_model_in_the_world_of_the_capture():
     np.testing.assert_allclose(moved[:, :3, 3], scene.poses[:, :3, 3], atol=0.03)
     sigma = np.sqrt(np.diag(result.cov))
     assert (np.linalg.eigvalsh(result.cov) > -1e-12).all() and sigma[6] == pytest.approx(result.sigma)
-    assert result.trajectory_scale[0] == pytest.approx(true, rel=0.03)
+    assert result.path.scale == pytest.approx(true, rel=0.03) and result.path.source == "the capture's poses"
+
+
+def spoilt(fault, size):
+    """A model of the room with another path: longer, curled by degrees, or every fifth view elsewhere by a fraction of
+    the depth; or every fifth map of another scale."""
+    views = made.room_model("maps")[0].views
+    c2w, depths = np.stack([view.c2w for view in views]), [view.depth for view in views]
+    middle, depth = c2w[:, :3, 3].mean(0), float(np.median(depths[0][depths[0] > 0]))
+    if fault == "longer":
+        c2w[:, :3, 3] = middle + (1 + size) * (c2w[:, :3, 3] - middle)
+    if fault == "curled":
+        turn = se3.exp(torch.tensor([[0, np.radians(size) / len(views), 0, 0, 0, 0]]).double())
+        for k in range(1, len(views)):
+            c2w[k:] = c2w[k] @ se3.to_matrix(turn)[0].numpy() @ np.linalg.inv(c2w[k]) @ c2w[k:]
+    if fault == "views":
+        c2w[::5, :3, 3] += size * depth / 3**0.5 * np.random.default_rng(0).choice((-1, 1), (len(c2w[::5]), 3))
+    if fault == "maps":
+        depths = [d * (1 + size) if k % 5 == 0 else d for k, d in enumerate(depths)]
+    return SceneModel([replace(v, c2w=m, depth=d) for v, m, d in zip(views, c2w, depths, strict=True)])
+
+
+def measure_without_poses(model, **options):
+    frames = [frame.replace(T_world_from_cam=None) for frame in made.room_scene().frames]
+    return metric_scale(model, frames, names=[v.name for v in model.views], cutoff=made.NEAR, **options)
+
+
+@pytest.mark.parametrize("measured", [measure, measure_without_poses])
+@pytest.mark.parametrize(
+    ("fault", "size", "kind"),
+    [
+        ("longer", 0.03, "path"),
+        ("longer", -0.06, "path"),
+        ("longer", 0.1, "path"),
+        ("curled", 10.0, "curl"),
+        ("curled", 40.0, "curl"),
+        ("views", 0.03, "views"),
+        ("views", 0.1, "views"),
+        ("maps", 0.03, "frames"),
+        ("maps", 0.1, "frames"),
+    ],
+)
+def test_a_path_that_contradicts_the_depths_is_refused_or_covered(measured, fault, size, kind):
+    result = measured(spoilt(fault, size))
+    if result.ok:
+        assert kind != "curl" and 2 * result.sigma > abs(size)
+    else:
+        assert kind in {f.kind for f in result.faults}
+    if abs(size) > 0.05:
+        assert not result.ok
+
+
+def test_a_sound_model_of_a_capture_without_poses_is_accepted():
+    model, true = made.room_model("maps")
+    result = measure_without_poses(model)
+    low, high = result.interval()
+    assert result.ok and low < true < high and result.path.source == "near returns"
+    assert result.path.scale == pytest.approx(true, rel=3 * result.path.sigma)
+
+
+def test_wrong_poses_of_the_capture_are_no_fault_of_the_model():
+    """Near returns between the views decide where they know the path better."""
+    model, true = made.room_model("maps")
+    frames = [
+        frame.replace(T_world_from_cam=frame.T_world_from_cam.replace(t=1.5 * frame.T_world_from_cam.t))
+        for frame in made.room_scene().frames
+    ]
+    result = metric_scale(model, frames, names=[v.name for v in model.views], cutoff=made.NEAR)
+    assert result.ok and result.path.source == "near returns" and abs(result.scale / true - 1) < 0.01
+
+
+def test_a_path_that_cannot_be_measured_is_noted():
+    model, _ = made.room_model("maps")
+    result = metric_scale(SceneModel(model.views[:2]), made.room_scene().frames[:2], names=["000000", "000001"])
+    assert result.path is None and any("a camera path of another scale would not be seen" in x for x in result.notes)
+
+
+@pytest.mark.parametrize(("steps", "second"), [([0.02] * 9, 5), ([0.3, 0.02, 0.02], 1), ([0.001] * 5, 0), ([], 0)])
+def test_a_motion_is_over_a_tenth_of_the_depth(steps, second):
+    c2w = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
+    c2w[1:, 0, 3] = np.cumsum(steps)
+    assert scale._choose_second(c2w, 1.0) == second
+    c2w[1:, 0, 0] = c2w[1:, 2, 2] = np.cos(0.6)  # more of a turn than two views have in common
+    assert scale._choose_second(c2w, 1.0) in (0, int(second == 1))
 
 
 def test_views_without_names_are_found_by_their_pictures(tmp_path):
@@ -91,14 +175,15 @@ def test_a_frame_has_a_pose_and_depths_in_a_view_of_another_picture(tmp_path):
     scene, (model, true) = made.room_scene(), made.room_model("maps")
     view = replace(model.views[2], image=tmp_path / "000002.png")
     uv, model_depth = scale._model_depths(model, view)
-    T, depth, used = scale._register(view, scene.frames[3].to(torch.float64), uv, made.NEAR)
+    fit, depth, used = scale._register(view, scene.frames[3].to(torch.float64), uv, made.NEAR)
+    T = fit.T_1_from_0
     expected = np.linalg.inv(scene.poses[2]) @ scene.poses[3]
     np.testing.assert_allclose(T.R[0], expected[:3, :3], atol=5e-3)
     np.testing.assert_allclose(T.t[0], expected[:3, 3], atol=0.015)
     assert int(used.sum()) > 40 and used.shape == depth.shape == model_depth.shape
     assert float((depth / (true * model_depth) - 1)[used].abs().median()) < 0.01
     floats = scene.frames[3].replace(image=scene.frames[3].image / 255).to(torch.float64)
-    torch.testing.assert_close(scale._register(view, floats, uv, made.NEAR)[0].t, T.t, atol=1e-4, rtol=0)
+    torch.testing.assert_close(scale._register(view, floats, uv, made.NEAR)[0].T_1_from_0.t, T.t, atol=1e-4, rtol=0)
     for lacking in (replace(view, image=None), view):
         none, depth, used = scale._register(lacking, scene.frames[3].to(torch.float64), uv[:20], made.NEAR)
         assert none is None and depth.shape == used.shape == (20,) and not used.any()

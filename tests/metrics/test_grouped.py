@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
-from dhtorch.metrics.camera_paths import align_camera_paths, scale_of_camera_paths
+from dhtorch.geometry import se3
+from dhtorch.metrics.camera_paths import align_camera_paths, compare_motions, motions_of_path
 from dhtorch.metrics.grouped import covariance_of_mean, grouped_slopes, huber_mean, mad_sigma, mean_over_stretches
 
 
@@ -53,5 +55,55 @@ def test_a_similarity_of_camera_paths():
     np.testing.assert_allclose(found, R, atol=1e-9)
     np.testing.assert_allclose(t, [1, 2, 3], atol=1e-9)
     assert cov.shape == (7, 7) and cov[6, 6] == pytest.approx(1e-4)
-    assert scale_of_camera_paths(own, other)[0] == pytest.approx(2.5)
-    assert scale_of_camera_paths(own[:1], other[:1]) is None
+
+
+def turned_path(n=24, curl=0.0):
+    """Cameras 0.1 m apart that turn by ``curl`` rad about y from the first to the last."""
+    c2w = np.tile(np.eye(4), (n, 1, 1))
+    angle = np.linspace(0, curl, n)
+    c2w[:, 0, 0], c2w[:, 0, 2], c2w[:, 2, 0], c2w[:, 2, 2] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
+    c2w[:, :3, 3] = np.cumsum(0.1 * c2w[:, :3, 0], 0)
+    return c2w
+
+
+def test_length_curl_and_single_cameras_of_a_path():
+    exact = motions_of_path(turned_path())
+    longer, curled, spoilt = turned_path(), turned_path(curl=0.2), turned_path()
+    longer[:, :3, 3] *= 1.06
+    assert compare_motions(exact, longer).length == pytest.approx(1.06)
+    found = compare_motions(exact, curled)
+    np.testing.assert_allclose(found.curl, [0, 0.2, 0], atol=2e-3)
+    assert found.length == pytest.approx(1, abs=0.01)
+    spoilt[10, 1, 3] += 0.05
+    found = compare_motions(exact, spoilt)
+    off = (exact.first == 10) | (exact.second == 10)
+    np.testing.assert_allclose(found.shift, np.where(off, 0.05, 0), atol=1e-3)
+    assert found.length == pytest.approx(1, abs=1e-3) and found.turn.max() < 1e-6
+    few = type(exact)(*(x[:2] for x in exact))
+    assert (
+        compare_motions(few, longer) is None and compare_motions(type(exact)(*(x[:0] for x in exact)), longer) is None
+    )
+
+
+def test_rotation_and_translation_that_are_not_known_apart_cost_the_length_nothing():
+    """At 1 m a turn about y and a shift along x look alike: only their sum is measured well."""
+    draw, path, exact = np.random.default_rng(0), turned_path(32), motions_of_path(turned_path(32))
+    alike = np.array([0, 1.0, 0, -1.0, 0, 0])
+    error = 0.02 * draw.normal(size=len(exact.T))
+    wrong = se3.to_matrix(se3.exp(torch.from_numpy(error[:, None] * alike))).numpy()
+    cov = np.tile(0.02**2 * np.outer(alike, alike) + 1e-8 * np.eye(6), (len(error), 1, 1))
+    path[:, :3, 3] *= 1.03
+    found = compare_motions(exact._replace(T=wrong @ exact.T, cov=cov), path)
+    assert found.length == pytest.approx(1.03, abs=2e-3) and found.length_sigma < 1e-3
+    assert np.std(np.linalg.norm((wrong @ exact.T)[:, :3, 3], axis=1)) > 0.01
+
+
+def test_sigma_of_a_length_is_of_the_scatter_along_the_path():
+    errors = []
+    for seed in range(40):
+        path, noise = turned_path(32), np.random.default_rng(seed).normal(size=(32, 3))
+        found = compare_motions(
+            motions_of_path(path), path + np.pad(0.01 * noise[:, :, None], ((0, 0), (0, 1), (3, 0)))
+        )
+        errors.append((found.length - 1) / found.length_sigma)
+    assert np.mean(np.abs(errors) < 2) > 0.75 and 0.6 < np.std(errors) < 1.7
