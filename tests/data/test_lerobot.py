@@ -186,7 +186,9 @@ def test_codes_to_metres(log: bool) -> None:
         lerobot_depth.dequantise_depth(feature, np.array([4096], dtype=np.uint16), Path("x"))
     for wrong in (5.0, -1.0, "0.2", None, [0.2], 10**400, float("nan"), float("inf")):
         bad = LeRobotFeature("d", "video", (1, 1), {"video.depth_min": wrong, "video.depth_max": 4.0})
-        with pytest.raises(FormatError, match=r"x: d depth_min, depth_max, shift: found .*, expected a range of metres"):
+        with pytest.raises(
+            FormatError, match=r"x: d depth_min, depth_max, shift: found .*, expected a range of metres"
+        ):
             lerobot_depth.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
     bad = LeRobotFeature("d", "video", (1, 1), {"video.shift": -0.01, "video.use_log": log})
     if log:
