@@ -158,9 +158,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("declared_depth_unit", 'feature["dtype"] == "video" or stored is not None', "True"),
         ("declared_depth_unit", 'None if feature["dtype"] == "video" else stored', "stored"),
         ("declared_depth_unit", 'or info.get("unit")', ""),
-        ("declared_depth_range", 'feature["dtype"] == "video"', "True"),
-        ("_ROUNDING_M", "0.51e-3", "0.0"),
-        ("_output_unit", 'key in (getattr(dataset.meta, "depth_keys", None) or ())', "True"),
     ],
     "transforms.layout": [
         ("conform", "_fill(sample, like)", "dict(sample)"),

@@ -119,9 +119,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("metres_by_code", "np.log(high + shift)) - shift", "np.log(high + shift))"),
         ("metres_by_code", "(N_CODES - 1)", "N_CODES"),
         ("metres_by_code", "low + fraction * (high - low)", "fraction * (high - low)"),
-        ("find_return_range", "max(rounding, (metres[2] - low) / 2)", "(metres[2] - low) / 2"),
-        ("find_return_range", "max(rounding, (high - metres[-3]) / 2)", "(high - metres[-3]) / 2"),
-        ("find_return_range", "float(metres[1])", "float(metres[0])"),
     ],
     "data.pairs": [
         ("by_time", "step / 2 if tolerance is None", "step / 20 if tolerance is None"),
