@@ -177,7 +177,10 @@ def calls():
         name = f"{row.fn.__module__.rsplit('.', 1)[-1]}.{row.fn.__name__}"
         name = name if name not in found else f"{name}, {sum(k.startswith(name) for k in found) + 1}"
         found[name] = lambda row=row: row.fn(*row.make(2, 7, torch.float64))
-    return found
+    tracks = found[
+        "features.match_features"
+    ]  # its round trip is rounding of single precision: another on each processor
+    return found | {"features.match_features": lambda: (x := tracks()).replace(error=x.error.round(decimals=4))}
 
 
 PROBLEMS |= calls()
@@ -186,7 +189,7 @@ PROBLEMS |= calls()
 #: Differences allowed, by the beginnings of names, where a part computes in single precision.
 TOLERANCES = {
     **dict.fromkeys(("pair window", "pair auto", "pair fused", "batch", "complete", "validate", "align affine"), 0.01),
-    **dict.fromkeys(("diagnose", "check"), 0.01),
+    **dict.fromkeys(("diagnose", "check", "scale of a model"), 0.01),
     **{"pair": 1e-4, "references": 1e-4, "align": 1e-3},
 }
 

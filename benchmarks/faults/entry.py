@@ -287,7 +287,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("replace_at_end", "folder.record(path, unfinished)", "pass"),
         ("_FILE_MODE", "0o644", "0o600"),
         ("has_files", "if not output_folder.is_private(entry.relative_to(folder))", ""),
-        ("read_file_version", ", status.st_ctime_ns", ""),
         ("compute_file_digest", "if now_ns - max(version[-2:]) > _SETTLED_NS:", "if True:"),
         ("copy_file", "is_as_long and compute_file_digest(path) == compute_file_digest(source)", "is_as_long"),
     ],

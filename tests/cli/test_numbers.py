@@ -373,7 +373,7 @@ def test_interpolated_pixels_are_never_called_recovered():
     for name, measured in (("some", known), ("none", {})):
         counts = {} if measured else {"recovered": 0.0}
         stats = recover_page.RecoveryStats(3, fractions | counts, pixels | counts, (), **measured)
-        told[name] = recover_page.describe_recovery(task, stats, (4, 6), SimpleNamespace(findings=()))[1]
+        told[name] = recover_page.describe_recovery(task, stats, (4, 6), SimpleNamespace(findings=(), poses=None))[1]
         numbers = recover_page.build_opening([], stats, b"", "").numbers
         assert numbers["Recovered pixels per frame"] == ("1,000" if measured else "0")
         assert (numbers["Filled, fraction of the pixels"], next(iter(numbers))) == (

@@ -30,6 +30,7 @@ from dhtorch.data.scene import Scene
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
+from dhtorch.runtime import safe_open
 from dhtorch.testing import parts
 
 # ------------------------------------------------------------------------------------------------ written, then read
@@ -525,7 +526,7 @@ def test_bad_pairs_and_arrays(tmp_path: Path) -> None:
 def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
-    for name, body in (("liar", bytes(64)), ("big", bytes(files.MAX_FILE_BYTES))):
+    for name, body in (("liar", bytes(64)), ("big", bytes(safe_open.MAX_FILE_BYTES))):
         with zipfile.ZipFile(tmp_path / f"{name}.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr("data.npy", head.getvalue() + body)
     with pytest.raises(
