@@ -93,11 +93,11 @@ def fit_motion(
     """
     free = [0, 1, 2, *([] if rotation_only else [3, 4, 5]), *([6] if zoom else [])]
     many = Sightings(*(x.expand(len(starts.t), *x.shape[1:]) for x in seen))
-    state = starts, torch.zeros_like(starts.t[:, 0])
+    T, log_zoom = starts, torch.zeros_like(starts.t[:, 0])
     for bend in FIT_BENDS_PX:
-        *state, _ = _step(many, *state, bend, free)
-    best = int(_step(many, *state, FIT_BENDS_PX[-1], free)[2].argmin())
-    T, log_zoom = (x[best : best + 1] for x in state)
+        T, log_zoom, _ = _step(many, T, log_zoom, bend, free)
+    best = int(_step(many, T, log_zoom, FIT_BENDS_PX[-1], free)[2].argmin())
+    T, log_zoom = T[best : best + 1], log_zoom[best : best + 1]
     for _ in range(FINAL_STEPS):
         rows, depth = _linearise(seen, T, log_zoom)
         T, log_zoom, _ = _step(

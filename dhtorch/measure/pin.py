@@ -247,8 +247,9 @@ class CameraPin:
         return tracks, seen, self._fit(seen, collate(starts))
 
     def _fit(self, seen: Sightings, starts: Pose, *, zoom: bool = False) -> MotionFit:
-        options = {"overlap": self.overlap, "rotation_only": not self.metric, "zoom": zoom}
-        return motion_fit.fit_motion(seen, starts, self.group, **options)
+        return motion_fit.fit_motion(
+            seen, starts, self.group, overlap=self.overlap, rotation_only=not self.metric, zoom=zoom
+        )
 
     def _conclude(self, fit: MotionFit, seen: Sightings) -> PinResult:
         """The offset of a fit with its shift, and the verdict."""

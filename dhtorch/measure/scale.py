@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ _BASELINE, _MOST_TURN = 0.1, 0.44
 
 #: Options of the pose from near returns: without a kernel, tracks that slide along an outline shorten the motions by
 #: .8 % in room 72 of scale_study, with it by .3 %.
-_ROBUST = {"threshold_px": 2.0, "kernel": "geman_mcclure", "kernel_px": 0.5, "polish_steps": 3}
+_ROBUST: dict[str, Any] = {"threshold_px": 2.0, "kernel": "geman_mcclure", "kernel_px": 0.5, "polish_steps": 3}
 
 #: Flags of returns that are no part of the ruler: at edges of depth and of the picture.
 _UNCLEAN = Flag.DEPTH_EDGE | Flag.BORDER
@@ -372,8 +372,8 @@ def _track_motions(
         if fit is not None:
             T = se3.compose(fit.T_1_from_0, se3.invert(pairs.T_view_from_frame))
             rows.append((first, second, se3.to_matrix(T)[0].numpy(), fit.cov[0].numpy()))
-    first, second, T, cov = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return CameraMotions(np.array(first, int), np.array(second, int), np.array(T), np.array(cov))
+    columns = list(zip(*rows, strict=True)) or [()] * 4
+    return CameraMotions(*(np.array(x, int) for x in columns[:2]), *(np.array(x) for x in columns[2:]))
 
 
 def _choose_second(c2w: np.ndarray, depth: float) -> int:
@@ -401,8 +401,8 @@ def _register(
     picture = view.read_picture() if own is None else own.image
     start = cam.resize_pixels(uv, view.hw, (picture.shape[-2], picture.shape[-1]))[None]
     start = start if own is None else _same_pixels(view, own, uv)
-    images = (grayscale(image).float() for image in (picture, frame.image))
-    tracks = lucas_kanade(*images, start, levels=5, normalise="gain_bias", start=coarse_flow)
+    image_0, image_1 = (grayscale(image).float() for image in (picture, frame.image))
+    tracks = lucas_kanade(image_0, image_1, start, levels=5, normalise="gain_bias", start=coarse_flow)
     samples = backproject(frame, tracks.uv_1, near_limit=limit)
     valid = tracks.valid & _is_clean(samples)[None]
     if int(valid.sum()) < _MIN_TRACKS:
