@@ -122,8 +122,7 @@ def check_regular_file(file: Path) -> int:
         return os.fstat(stream.fileno()).st_size
 
 
-#: The capture or model being read, whose links must not point outside it, and the end of the message on one that does;
-#: None = no restriction.
+#: Folder or file being read, whose links must not point outside it, and what it is; None = no restriction.
 _restricted_root: ContextVar[tuple[Path, str] | None] = ContextVar("capture", default=None)
 
 
@@ -143,9 +142,9 @@ def record_opened_files() -> Iterator[set[Path]]:
 
 
 @contextmanager
-def restrict_links(root: Path | None, expected: str = "a file inside (follow_links=true allows)") -> Iterator[None]:
-    """Context in which links below ``root`` that point outside it are refused; None = no restriction."""
-    token = _restricted_root.set(None if root is None else (root, expected))
+def restrict_links(root: Path | None, what: str = "capture") -> Iterator[None]:
+    """Context in which links below ``root``, a ``what``, that point outside it are refused; None = no restriction."""
+    token = _restricted_root.set(None if root is None else (root, what))
     try:
         yield
     finally:
@@ -160,11 +159,12 @@ def is_inside(file: Path, root: Path) -> bool:
 
 def check_link(file: Path) -> None:
     """Raise FormatError for a link that points outside the capture being read (see :func:`restrict_links`)."""
-    restriction = _restricted_root.get()
-    if restriction is None or not file.is_relative_to(restriction[0]):
+    root, what = _restricted_root.get() or (None, "")
+    if root is None or not file.is_relative_to(root):
         return
-    if not is_inside(file, restriction[0]):
-        raise FormatError(file, "link", "one to outside the capture", restriction[1])
+    if not is_inside(file, root):
+        expected = "a file inside" + " (follow_links=true allows)" * (what == "capture")
+        raise FormatError(file, "link", f"one to outside the {what}", expected)
 
 
 def check_memory(file: Path, field: str, takes: int, value: object, requested: int = 0) -> None:

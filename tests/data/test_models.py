@@ -227,7 +227,7 @@ def write_with_link(tmp_path, kind, name, elsewhere):
 @pytest.mark.parametrize(("kind", "name"), LINKED)
 def test_a_link_out_of_a_model_is_not_followed(tmp_path, kind, name):
     folder = write_with_link(tmp_path, kind, name, tmp_path / "elsewhere")
-    with pytest.raises(FormatError, match=r"link: found one to outside .*, expected a file inside the model's folder$"):
+    with pytest.raises(FormatError, match=r"link: found one to outside the model, expected a file inside$"):
         read_model(folder)
 
 

@@ -11,7 +11,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.models.colmap import find_colmap_model, read_colmap_model
 from dhtorch.data.models.nerfstudio import read_nerfstudio_model
 from dhtorch.data.models.network import read_network_model
-from dhtorch.data.models.scene_model import INSIDE_MODEL, ModelView, SceneModel, Similarity, write_model
+from dhtorch.data.models.scene_model import ModelView, SceneModel, Similarity, write_model
 from dhtorch.data.models.splat import read_splat_model
 from dhtorch.data.readers.nerfstudio import find_transforms
 from dhtorch.runtime.safe_open import restrict_links
@@ -31,7 +31,7 @@ def read_model(root: str | Path, *, images: str | Path | None = None) -> SceneMo
             folder.
     """
     root = Path(root)
-    with restrict_links(root if root.is_dir() else root.parent, INSIDE_MODEL):
+    with restrict_links(root if root.is_dir() else root.parent, "model"):
         return _checked(_read_format(root, None if images is None else Path(images)))
 
 

@@ -25,10 +25,6 @@ from dhtorch.runtime.safe_open import check_link, check_regular_file, restrict_l
 _OCCLUSION_REL, _OCCLUSION_CELLS = 0.05, 48
 
 
-#: What is expected instead of a link that leads out of a model, for messages.
-INSIDE_MODEL = "a file inside the model's folder"
-
-
 class Similarity(NamedTuple):
     """x' = scale · R x + t."""
 
@@ -153,7 +149,7 @@ def check_inside(file: Path, folder: Path) -> Path:
     Raises:
         FormatError: a link does.
     """
-    with restrict_links(folder, INSIDE_MODEL):
+    with restrict_links(folder, "model"):
         check_link(file)
     return file
 
