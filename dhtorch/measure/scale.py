@@ -71,6 +71,10 @@ _MOTIONS = 40
 #: between them, rad. Source: chosen, the path's scale to 3 % by one motion in rooms and most of the view in common.
 _BASELINE, _MOST_TURN = 0.1, 0.44
 
+#: Standard deviation of log(scale of the path over that of the depths) where no motion is measured. Source: two of them
+#: are the largest change of length that scale_study plants.
+_UNSEEN_PATH = 0.05
+
 #: Options of the pose from near returns: without a kernel, tracks that slide along an outline shorten the motions by
 #: .8 % in room 72 of scale_study, with it by .3 %.
 _ROBUST: dict[str, Any] = {"threshold_px": 2.0, "kernel": "geman_mcclure", "kernel_px": 0.5, "polish_steps": 3}
@@ -200,11 +204,15 @@ def metric_scale(
     scale = float(np.exp(mean))
     compare = partial(measure_path, scale=scale, depth=float(depth), tolerance=tolerance)
     path = _compare_path(model, frames, route, list(zip(matches, pairs, strict=True)), compare, limit=cutoff, own=own)
-    if path is None:
-        notes.append("no motion between views could be measured: a camera path of another scale would not be seen")
-    else:
-        faults = path.faults + faults
-    terms = {"frames": scatter, "sensor": own, "model": max(bend / 12**0.5, path.spread if path else 0.0)}
+    unseen = path is None and len(model.views) > 1
+    if unseen:
+        notes.append(
+            "no motion between views could be measured: a camera path of another scale would not be seen, and U covers "
+            f"one that is up to {2 * _UNSEEN_PATH:.0%} longer or shorter than the depths"
+        )
+    faults = (path.faults if path else []) + faults
+    spread = path.spread if path else _UNSEEN_PATH * unseen
+    terms = {"frames": scatter, "sensor": own, "model": max(bend / 12**0.5, spread)}
     sigma = float(np.sqrt(sum(term**2 for term in terms.values())))
     R, t, cov = None, None, None
     if (poses := _poses_of(pairs)) is not None:

@@ -135,10 +135,12 @@ def test_wrong_poses_of_the_capture_are_no_fault_of_the_model():
     assert result.ok and result.path.source == "near returns" and abs(result.scale / true - 1) < 0.01
 
 
-def test_a_path_that_cannot_be_measured_is_noted():
+def test_a_path_that_cannot_be_measured_widens_the_interval():
+    """Two views are fewer than three motions: U covers a path that is 10 % longer than the depths."""
     model, _ = made.room_model("maps")
     result = metric_scale(SceneModel(model.views[:2]), made.room_scene().frames[:2], names=["000000", "000001"])
     assert result.path is None and any("a camera path of another scale would not be seen" in x for x in result.notes)
+    assert 2 * result.sigma > 0.1
 
 
 @pytest.mark.parametrize(("steps", "second"), [([0.02] * 9, 5), ([0.3, 0.02, 0.02], 1), ([0.001] * 5, 0), ([], 0)])
