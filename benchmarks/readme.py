@@ -678,22 +678,11 @@ def scaled() -> str:
 
 
 def caught() -> str:
-    """Planted faults that a test of their module caught, of those that change an answer."""
-    counts = mutants.by_module(read_json(RESULTS / "mutants.json"), packages=True)
-    cells = [
-        [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in counts
-    ]
-    return table(["faults planted in", "caught", "change no answer"], cells)
-
-
-def caught_by_rule() -> str:
-    """Faults that rules drew and a test caught, of those that change an answer."""
-    rows = read_json(RESULTS / "mutants_sweep.json")
-    _, n, of, same = mutants.by_module(rows)[-1]
-    return table(
-        ["faults drawn with the seed", "caught", "share", "change no answer"],
-        [[f"`{rows[0]['seed']}`", f"{n} of {of}", f"{n / of:.0%}", f"{same}"]],
-    )
+    """Faults drawn by rule that a test caught, by group of packages."""
+    rows = read_json(RESULTS / "mutants.json")
+    seed = rows[0]["seed"]
+    cells = [[name, f"{n} of {of}", f"{n / of:.0%}"] for name, n, of in mutants.summarize(rows) if name[0] != "`"]
+    return table([f"faults drawn with the seed `{seed}` in", "caught", "fraction"], cells)
 
 
 def lerobot_trained() -> str:
@@ -778,10 +767,7 @@ TABLES |= {
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
-    {"speed": speed_tables.stages, "mutants": caught, "mutants by rule": caught_by_rule}
-    | speed_tables.TABLES
-    | beside_kornia.TABLES
-    | pose_tables.TABLES
+    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
 )
 TABLES |= kornia_adapters.TABLES | learning_tables.TABLES | reader_tables.TABLES | client_tables.TABLES
 TABLES |= {

@@ -114,8 +114,7 @@ SCRIPTS |= {
     "degenerate": "",
     "sensitivity": "",
     "capture_faults": "",
-    "mutants": "--quiet",
-    "mutants_sweep": "--sweep 0.0025 --seed COMMIT",  # the first eight digits of the commit that is measured
+    "mutants": "300 --lines lines.json",  # written by `mutants.py --record lines.json` on the same commit
     "kornia": "--clock cpu",
     "kornia_adapters": "",
     "xfeat_noise": "",
@@ -156,7 +155,6 @@ NAMED = {
     "first_picture": "captures",
     "kornia": "beside_kornia",
     "loader_workers0": "loader",
-    "mutants_sweep": "mutants",
     "dense_speed": "dense",
     "clients": "clients/all",
     **{name: f"clients/{name}" for name in ("readers_3d", "tiny_field", "lerobot_train", "lerobot_plugin")},
