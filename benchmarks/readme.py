@@ -900,7 +900,7 @@ def _written(name: str) -> str:
     part = maker(name)()
     if name == "make: experiments":  # of docs/hooks.py, with every archived answer
         _names_read.update(archived_answers())
-    old = sorted(_names_read & reproduce.OUTDATED)
+    old = sorted(name for name in _names_read if reproduce.other_settings(name))
     files = ", ".join(f"`{each}.json`" for each in old)
     note = f"\n\n*Made with the settings of an earlier release, not of this one: {files}. "
     note += f"`python benchmarks/reproduce.py {' '.join(old)}` makes them again.*"

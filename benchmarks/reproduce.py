@@ -2,7 +2,10 @@
 
 python benchmarks/reproduce.py                  run all of them again, one after the other (hours)
 python benchmarks/reproduce.py heldout icp      some of them
-python benchmarks/reproduce.py --check          exit 1 where a file holds other settings than its command gives today
+python benchmarks/reproduce.py --check          names files of other settings or code than today's; exit 1 where any is
+python benchmarks/reproduce.py --renew heldout  records today's code where it gives the answers of the recorded commit
+python benchmarks/reproduce.py --quick outputs  README's tables on fewer scenes, for a look: nothing committed changes
+python benchmarks/reproduce.py --list           results that need another machine, and what it must have
 
 Experiments read real sequences from DHTORCH_DATA. Speeds are only worth something on a machine that does nothing else.
 """
@@ -12,15 +15,18 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from dhtorch.cli.run import config_dir, job_name
+from dhtorch.runtime import code_dependencies as code
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
@@ -185,20 +191,32 @@ LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": No
 LEFT_OUT |= {"weight": "variance"}
 LEFT_OUT |= dict.fromkeys(("trajectory_lag_s", "trajectory_drift_deg_per_s", "trajectory_rotation_noise_deg"), 0.0)
 
-#: Files that were made with other settings than today's, and wait for a quiet machine.
-OUTDATED: set[str] = {"part_ablation", "streams", "stress"}
-#: Those whose ``auto`` is that of the second release.
-OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
-#: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
-OUTDATED |= {"kornia_twin", "part_ablation_auto"}
-
-#: Files with the settings of today that were made before their range-split candidates had to be masked returns of the
-#: sensor: on independent truth (built-in rooms) real holes are among their candidates, on sparse maps (driving scenes)
-#: 6 of 330 samples with a near return in reach. They wait for a quiet machine.
-UNMASKED_CANDIDATES: set[str] = {
-    *("kornia_twin", "learned_confidence", "learned_score", "part_ablation_auto"),
-    *("sweep", "track_chain", "views_study"),
+#: What a result needs beside this machine and an idle hour; speeds need a machine that does nothing else.
+NEEDS = {
+    "gpu": "a CUDA device",
+    **dict.fromkeys(("clients", "readers_3d", "tiny_field", "lerobot_train", "lerobot_plugin"), "other interpreters"),
+    "closed_loop": "mujoco",
+    "mutants": "lines.json of `mutants.py --record lines.json` on the same commit",
+    **dict.fromkeys(
+        name
+        for name, options in SCRIPTS.items()
+        if "--clock" in options or name in ("latency", "memory", "scaling", "readers", "triangulate", "first_picture")
+    ),
 }
+NEEDS = {name: need or "a quiet machine" for name, need in NEEDS.items()}
+
+#: The tables of README, on fewer scenes, pairs or seeds -> further options: twenty minutes on two cores together.
+QUICK = {
+    "method_comparison": "experiment.seeds=1 pairs.max_pairs=2",
+    "dense": "experiment.reference_views=1",
+    "align_study": "experiment.reference_views=1",
+}
+
+#: Packages whose results ``same_bits.py`` compares.
+SAME_BITS = ("codes", "pytree", "records", "geometry", "ops", "stages", "pipeline", "alignment", "validation")
+
+#: Result -> the commit and the digest of the code that made it, and of the file itself.
+PROVENANCE = RESULTS / "provenance.json"
 
 
 def command(name: str) -> str:
@@ -231,15 +249,107 @@ def differences(actual: Any, expected: Any, where: str = "") -> list[str]:
     return [] if actual == expected else [f"{where}: found {actual!r}, expected {expected!r}"]
 
 
-def check(name: str) -> list[str]:
-    """What a committed file holds otherwise than its command would give today."""
+@cache
+def other_settings(name: str) -> list[str]:
+    """Options that the file of an experiment holds otherwise than its command gives today."""
+    path = RESULTS / f"{name}.json"
+    if name not in EXPERIMENTS or not path.is_file():
+        return []
+    return differences(result_files.read_result(path)["config"], settings(name))
+
+
+def reachable(name: str, root: Path = HERE.parent) -> dict[str, Path]:
+    """Name -> file of all code that the command of a result reaches by imports in a checkout."""
+    if name in EXPERIMENTS:
+        return code.find_reachable_modules([*code.iter_targets(settings(name)), "dhtorch.cli.job"], root / "dhtorch")
+    script = root / "benchmarks" / f"{NAMED.get(name, name)}.py"
+    local = [script, *(root / "benchmarks" / f"{word}.py" for word in ("harness", "cells"))]
+    imports = [each for path in local for each in code.iter_imports(path.read_text())]
+    return {**{path.name: path for path in local}, **code.find_reachable_modules(imports, root / "dhtorch")}
+
+
+def check(name: str) -> str:
+    """Why a committed file is not what its command would give today; empty where nothing speaks against it."""
     path = RESULTS / f"{name}.json"
     if not path.is_file():
-        return [f"no {path.name}; run: {command(name)}"]
+        return f"no {path.name}"
+    made, options = provenance().get(name, {}), other_settings(name)
+    if options:
+        shown = ", ".join(option.partition(":")[0] for option in options[:3])
+        return f"{path.name}: {len(options)} other options ({shown}{', …' if len(options) > 3 else ''})"
+    if made.get("file") != storage.compute_file_digest(path):
+        return f"{path.name}: made without this script, neither its commit nor its code is recorded"
+    if made["code"] != code.compute_code_digest(reachable(name)):
+        return f"{path.name}: other code than that of {made['commit']}"
+    return ""
+
+
+def provenance() -> dict[str, Any]:
+    """Result -> ``{commit, code, file}``; of a renewed one also ``renewed``, the commit, and ``by``, the comparison."""
+    return json.loads(PROVENANCE.read_text()) if PROVENANCE.is_file() else {}
+
+
+def note(name: str, **more: str) -> None:
+    """Record commit and code of a result that was made, or compared, on this code."""
+    made = {
+        "commit": result_files.read_git_revision(HERE.parent / "dhtorch"),
+        "code": code.compute_code_digest(reachable(name)),
+        "file": storage.compute_file_digest(RESULTS / f"{name}.json"),
+    }
+    storage.write_json(PROVENANCE, dict(sorted({**provenance(), name: {**made, **more}}.items())))
+
+
+def renew(name: str) -> bool:
+    """Whether a result is that of today's code although the code differs; then its digest becomes today's.
+
+    Where all modules that differ lie in the packages of ``same_bits.py``, that comparison decides, else the rows of the
+    job on its first scene, on the recorded commit and here.
+    """
+    made = provenance().get(name)
+    if not check(name):
+        return True
+    if made is None or other_settings(name) or not made["commit"]:
+        print(f"{name}: not renewed: {check(name)}")
+        return False
+    with tempfile.TemporaryDirectory() as folder:
+        old = Path(folder) / "old"
+        subprocess.run(["git", "-C", HERE.parent, "worktree", "add", "--detach", old, made["commit"]], check=True)
+        try:
+            here, there = (
+                {k: code.digest_source(path) for k, path in reachable(name, root).items()}
+                for root in (HERE.parent, old)
+            )
+            changed = {k for k in {*here, *there} if here.get(k) != there.get(k)}
+            if all(k.partition("/")[0].removesuffix(".py") in SAME_BITS for k in changed):
+                by = "same_bits.py"
+                words = [sys.executable, HERE / "same_bits.py", old, HERE.parent, "--quick"]
+                equal = subprocess.run(words, check=False).returncode == 0
+            else:
+                by = "rows of its first scene"
+                rows = [first_scene(name, root, Path(folder) / f"{root.name}_out") for root in (old, HERE.parent)]
+                equal = rows[0] == rows[1] is not None
+        finally:
+            subprocess.run(["git", "-C", HERE.parent, "worktree", "remove", "--force", old], check=True)
+    if equal:
+        note(name, commit=made["commit"], renewed=result_files.read_git_revision(HERE.parent / "dhtorch") or "", by=by)
+    print(f"{name}: {'renewed' if equal else 'not renewed: other answers'} ({by}; {len(changed)} modules differ)")
+    return equal
+
+
+def first_scene(name: str, root: Path, output: Path) -> list[dict[str, Any]] | None:
+    """Rows of an experiment on the first scene of its data, without times, by a checkout's code; None = it failed."""
     if name in SCRIPTS:
-        return []
-    config = result_files.read_result(path)["config"]
-    return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
+        return None
+    data = settings(name)["data"]
+    key = next((k for k in ("scenes", "seed") if isinstance(data.get(k), list)), None)
+    first = [] if key is None else [f"data.{key}={json.dumps(data[key][:1]).replace(chr(34), '')}"]
+    words = [*command(name).split()[1:], *first, f"output={output}"]
+    env = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-m", "dhtorch", *words], cwd=root, env=env, check=False)
+    if done.returncode:
+        return None
+    rows = result_files.read_result(output / "result.json")["rows"]
+    return [{k: v for k, v in row.items() if k != "ms"} for row in rows]
 
 
 #: Experiments of whose single pairs a page reads numbers; of the others it only counts them.
@@ -258,18 +368,22 @@ def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
     return {**result, "rows": [kept(row) for row in result["rows"]]}
 
 
-def run(name: str) -> bool:
-    """Make one result file; whether that went well."""
-    print(f"== {command(name)}", flush=True)
+def run(name: str, further: str = "", target: Path = RESULTS) -> bool:
+    """Make one result file with further options; whether that went well."""
+    path = target / f"{name}.json"
+    print(f"== {command(name)} {further}", flush=True)
     if name in SCRIPTS:
-        words = [sys.executable, *command(name).split()[1:]]
-        return subprocess.run(words, cwd=HERE.parent, check=False).returncode == 0
-    with tempfile.TemporaryDirectory() as folder:
-        words = [*command(name).split()[1:], f"output={folder}"]
-        done = subprocess.run([sys.executable, "-m", "dhtorch", *words], cwd=folder, check=False)
-        if done.returncode == 0:
-            result = result_files.read_result(Path(folder) / "result.json")
-            result_files.write_result(RESULTS / f"{name}.json", without_detail(result))
+        words = [sys.executable, *command(name).split()[1:-1], str(path)]
+        done = subprocess.run(words, cwd=HERE.parent, check=False)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            words = [*command(name).split()[1:], *further.split(), f"output={folder}"]
+            done = subprocess.run([sys.executable, "-m", "dhtorch", *words], cwd=folder, check=False)
+            if done.returncode == 0:
+                result = result_files.read_result(Path(folder) / "result.json")
+                result_files.write_result(path, without_detail(result))
+    if done.returncode == 0 and target == RESULTS:
+        note(name)
     return done.returncode == 0
 
 
@@ -278,17 +392,30 @@ def main() -> int:
     known = {**EXPERIMENTS, **SCRIPTS}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
-    parser.add_argument("--check", action="store_true")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--check", action="store_true", help="name files of other settings or code; exit 1 where any is")
+    which.add_argument("--renew", action="store_true", help="record today's code where the answers are equal")
+    which.add_argument("--quick", type=Path, metavar="FOLDER", help="README's tables on fewer scenes, into FOLDER")
+    which.add_argument("--list", action="store_true", help="results that need more than this machine, and what")
     args = parser.parse_args()
     for name in args.names:
         if name not in known:
             parser.error(f"found {name!r}, expected {', '.join(known)}")
     names = args.names or list(known)
+    if args.list:
+        print("\n".join(f"{name}: {NEEDS[name]}" for name in names if name in NEEDS))
+        return 0
     if args.check:
-        wrong = [line for name in names for line in check(name)]
-        print("\n".join(wrong) or f"{len(names)} result files have the settings of their commands")
+        wrong = {name: why for name in names if (why := check(name))}
+        print("\n".join(wrong.values()) or f"{len(names)} result files are those of their commands and of this code")
+        if wrong:
+            print(f"make them again: python benchmarks/reproduce.py {' '.join(wrong)}")
         return int(bool(wrong))
-    failed = [name for name in names if not run(name)]
+    if args.quick:
+        args.quick.mkdir(parents=True, exist_ok=True)
+        failed = [name for name in args.names or QUICK if not run(name, QUICK.get(name, ""), args.quick.resolve())]
+    else:
+        failed = [name for name in names if not (renew(name) if args.renew else run(name))]
     print(json.dumps({"failed": failed}) if failed else "all done")
     return int(bool(failed))
 

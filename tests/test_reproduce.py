@@ -25,44 +25,21 @@ def test_every_result_has_a_command_and_every_command_its_result():
     assert {*reproduce.EXPERIMENTS, *reproduce.SCRIPTS} == RESULTS
 
 
-@pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS))
-def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
-    assert (reproduce.check(name) == []) == (name not in reproduce.OUTDATED)
-
-
-@pytest.mark.parametrize(
-    ("part", "files"),
-    [
-        ("kornia twin", {"kornia_twin"}),
-        ("validate", {"validate_study", "validate_study_streams", "validate_study_unseen"}),
-        ("results part_ablation", {"part_ablation"}),
-        ("make: experiments", reproduce.OUTDATED),
-        ("track chain", set()),
-        ("pin", set()),
-    ],
-)
-def test_a_table_from_a_file_with_earlier_settings_has_a_note_that_names_it(part, files):
-    name = re.escape(part)
+@pytest.mark.parametrize(("part", "names"), [("results part_ablation", {"part_ablation"}), ("pin", set())])
+def test_a_table_from_a_file_with_earlier_settings_has_a_note_that_names_it(part, names):
+    assert {name for name in names if not reproduce.other_settings(name)} == set()
     blocks = [
-        m for page in PAGES for m in re.findall(rf"<!-- {name} -->(.*?)<!-- end -->", (REPO / page).read_text(), re.S)
+        m for page in PAGES for m in re.findall(rf"<!-- {part} -->(.*?)<!-- end -->", (REPO / page).read_text(), re.S)
     ]
     assert blocks, "no page has this part"
     for block in blocks:
         notes = re.findall(r"\*Made with the settings of an earlier release, not of this one: (.*?)\. ", block)
-        assert {n for note in notes for n in re.findall(r"`(\w+)\.json`", note)} == set(files)
+        assert {n for note in notes for n in re.findall(r"`(\w+)\.json`", note)} == names
 
 
 def test_a_column_of_the_first_release_is_labelled():
     assert readme.heading("map", "untouched") == readme.heading("map", "method_comparison") == "`map` of release 1"
     assert readme.heading("map", "track_chain") == "`map`" and readme.heading("paper", "untouched") == "`paper`"
-
-
-@pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS.keys() - reproduce.OUTDATED))
-def test_candidates_of_a_result_are_masked_returns_or_it_is_listed(name):
-    """A range split that counts real holes apart says so in every row of a scene that has candidates."""
-    rows = result_files.read_result(REPO / f"benchmarks/results/{name}.json")["rows"]
-    split = [r for r in rows if r["pair"] is None and r.get("truth") in ("raw", "5x5", "full") and "n_dropped" in r]
-    assert (name in reproduce.UNMASKED_CANDIDATES) == (bool(split) and not all("n_real_holes" in row for row in split))
 
 
 def test_no_result_has_a_sigma_of_a_method_that_states_none():
@@ -75,15 +52,27 @@ def test_no_result_has_a_sigma_of_a_method_that_states_none():
         assert (result["summary"][f"{method}.within_sigma"]["value"] is not None) == states, method
 
 
-def test_another_setting_is_seen(tmp_path, monkeypatch):
+def test_other_settings_code_or_content_of_a_result_are_named(tmp_path, monkeypatch):
+    """What ``--check`` prints, for a result that is made, edited, and whose code changes."""
     result = result_files.read_result(REPO / "benchmarks/results/global_map.json")
-    result["config"]["experiment"]["n"] = 1
-    (tmp_path / "global_map.json").write_text(json.dumps(result))
     monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
-    (line,) = reproduce.check("global_map")
-    assert "experiment.n: found 1, expected 1024" in line and "experiment.n=1024" in line
-    (line,) = reproduce.check("icp")
-    assert "no icp.json" in line
+    monkeypatch.setattr(reproduce, "PROVENANCE", tmp_path / "provenance.json")
+    path = result_files.write_result(tmp_path / "global_map.json", result)
+    assert "neither its commit nor its code is recorded" in reproduce.check("global_map")
+    reproduce.note("global_map")
+    assert reproduce.check("global_map") == "" and reproduce.provenance()["global_map"]["commit"]
+    monkeypatch.setattr(reproduce, "reachable", lambda name: {"a.py": path})
+    assert "other code" in reproduce.check("global_map")
+    path.write_text(path.read_text() + " ")
+    assert "neither its commit" in reproduce.check("global_map")
+    assert "no icp.json" in reproduce.check("icp")
+    other = {"experiment": {"n": 1}, "root": "elsewhere"}
+    assert reproduce.differences(other, {"experiment": {"n": 1024}}) == ["experiment.n: found 1, expected 1024"]
+
+
+@pytest.mark.parametrize("name", ["heldout", "sweep"])
+def test_a_result_depends_on_the_stages_and_the_kernels(name):
+    assert {"geometry/lucas_kanade.py", "ops/csrc/search.cpp"} <= {*reproduce.reachable(name)}
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -24,7 +24,7 @@ from dhtorch.experiments.focal.stacks import FocalStacks
 from dhtorch.experiments.pictures import draw_example
 from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
 from dhtorch.ops import loader
-from dhtorch.runtime import console, storage
+from dhtorch.runtime import code_dependencies, console, storage
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, OutputFolder, open_output_folder
@@ -78,7 +78,9 @@ def run(
     names = {group: choices[group] for group in SETTINGS_GROUPS}
     data_sets = _resolve_data(parts["data"])
     digest = result_files.compute_data_digest({**_list_data_files(data_sets), **_list_settings_files(settings)})
-    key = result_files.compute_result_key({**settings, "choices": names}, digest)
+    modules = code_dependencies.find_reachable_modules(code_dependencies.iter_targets(settings))
+    code = code_dependencies.compute_code_digest(modules)
+    key = result_files.compute_result_key({**settings, "choices": names}, digest, code=code)
     target = folder / "result.json"
     for data_set in data_sets if _LOG.isEnabledFor(logging.DEBUG) else ():
         sequence = data_set.recording if isinstance(data_set, Scene) else data_set
@@ -89,7 +91,7 @@ def run(
         return JobStatus(str(folder), "untouched")
     with open_output_folder(folder, "output") as output:
         _check_files(output, target, data_sets)
-        return _write_result(settings, parts, names, (target, key, digest), data_sets, progress, swept=swept)
+        return _write_result(settings, parts, names, (target, key, digest, code), data_sets, progress, swept=swept)
 
 
 def _check_files(output: OutputFolder, target: Path, data_sets: Sequence[Scene] | Sequence[FocalStacks]) -> None:
@@ -107,14 +109,14 @@ def _write_result(
     settings: Mapping[str, Any],
     parts: Mapping[str, Any],
     names: Mapping[str, str],
-    place: tuple[Path, str, str],  # result file, key, digest of the data
+    place: tuple[Path, str, str, str],  # result file, key, digests of the data and of the code
     data_sets: Sequence[Scene] | Sequence[FocalStacks],
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
     *,
     swept: bool,
 ) -> JobStatus:
     """Run the experiment and write its files."""
-    target, key, digest = place
+    target, key, digest, code = place
     folder = target.parent
     methods = {names["method"]: parts["method"]}
     finished = FinishedScenes(folder / _SCENES_FOLDER, _scenes_key(settings, key), reuse=settings["resume"])
@@ -126,6 +128,7 @@ def _write_result(
     scenes = [data_set.name for data_set in data_sets]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _build_result(settings, names["experiment"], key, data, outcome)
+    result["meta"]["code"] = code
     _write_data_root(folder, settings)
     result_files.write_result(target, result)
     finished.remove()

@@ -6,6 +6,8 @@ invalidate a running sweep, editing a stage does.
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import importlib.util
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -58,9 +60,30 @@ def find_reachable_modules(names: Iterable[str], folder: str | Path | None = Non
             if key != "__init__.py":
                 waiting += iter_imports(path.read_text(encoding="utf-8"))
     folders = {p.parent for key, p in files.items() if "/" in key and not key.startswith(_EXTERNAL_PREFIX)}
-    for subfolder in folders:
-        files |= {p.relative_to(folder).as_posix(): p for p in subfolder.iterdir() if p.is_file() and p.suffix != ".py"}
+    for path in (p for subfolder in folders for p in (*subfolder.iterdir(), *subfolder.glob("csrc/*"))):
+        if path.is_file() and path.suffix != ".py":
+            files[path.relative_to(folder).as_posix()] = path
     return dict(sorted(files.items()))
+
+
+def compute_code_digest(files: Mapping[str, Path]) -> str:
+    """Name → file, from :func:`find_reachable_modules` -> SHA-256 over syntax trees; comments, layout and docstrings do
+    not enter."""
+    total = hashlib.sha256()
+    for name in sorted(files):
+        total.update(f"{name} {digest_source(files[name])} ".encode())
+    return total.hexdigest()
+
+
+def digest_source(path: Path) -> str:
+    """SHA-256 of the syntax tree of a Python file without docstrings; of the bytes of any other file."""
+    if path.suffix != ".py":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
 def iter_imports(source: str) -> Iterator[str]:

@@ -68,7 +68,7 @@ _META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": d
 _META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
 #: Fields added later: optional when reading.
 _ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str, "metrics": list}
-_ADDED_META_FIELDS: dict[str, Any] = {"processor": str, "operators": str}
+_ADDED_META_FIELDS: dict[str, Any] = {"processor": str, "operators": str, "code": str}
 _DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
 _SUMMARY_FIELDS: dict[str, Any] = {
     "value": _OPTIONAL_NUMBER,
@@ -222,7 +222,12 @@ def is_finished(path: str | Path, key: str) -> bool:
 
 
 def compute_result_key(
-    config: Mapping[str, Any], digest: str, *, roots: Iterable[str] = (), code_dir: str | Path | None = None
+    config: Mapping[str, Any],
+    digest: str,
+    *,
+    roots: Iterable[str] = (),
+    code_dir: str | Path | None = None,
+    code: str | None = None,
 ) -> str:
     """SHA-256 over everything that determines a result: settings, reachable code, data digest.
 
@@ -232,14 +237,16 @@ def compute_result_key(
         digest: of the data, from :func:`compute_data_digest`.
         roots: further modules that take part, beside those named in the settings.
         code_dir: folder of this package; None = the installed one.
+        code: digest from :func:`dhtorch.runtime.code_dependencies.compute_code_digest`; None = the bytes of all files
+            that are reached, which are not parsed.
     """
     settings = json.dumps(_drop_non_key_options(make_portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
-    for text in (settings, digest):
+    for text in (settings, digest, *(() if code is None else (code,))):
         _update_digest(total, text.encode())
-    for name, file in code_dependencies.find_reachable_modules(
-        [*code_dependencies.iter_targets(config), *roots], code_dir
-    ).items():
+    targets = [*code_dependencies.iter_targets(config), *roots]
+    files = code_dependencies.find_reachable_modules(targets, code_dir) if code is None else {}
+    for name, file in files.items():
         _update_digest(total, name.encode())
         _update_digest(total, file.read_bytes())
     return total.hexdigest()

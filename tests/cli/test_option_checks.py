@@ -84,10 +84,11 @@ def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch)
         (tmp_path / name).mkdir(parents=True)
     for name in ("job", "sweep/1"):
         (tmp_path / name / "result.json").write_text("{}")
-    for words_ in (["capture"], ["view"], ["view", "data=tum"], ["job"], ["sweep"], ["nowhere"]):
+    for words_ in (["capture"], ["view"], ["view", "data=tum"], ["job"], ["sweep"]):
         assert command("view", *words_)[0] == 0
-    assert [s["result"] for s in asked] == [None, None, None, "job", "sweep", "nowhere"]
-    assert [s["choices"]["data"] for s in asked] == ["auto", "auto", "tum", *["synthetic"] * 3]
+    assert command("view", "nowhere")[0] == 2
+    assert [s["result"] for s in asked] == [None, None, None, "job", "sweep"]
+    assert [s["choices"]["data"] for s in asked] == ["auto", "auto", "tum", *["synthetic"] * 2]
     assert [s["data"]["root"] for s in asked[:3]] == ["capture", "view", "view"]
 
 

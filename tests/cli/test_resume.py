@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import re
 import shlex
 import signal
@@ -39,7 +40,8 @@ LAUNCHERS = {
 
 
 def results(folder):
-    return sorted(folder.rglob("result.json"))
+    """Files of finished jobs; folders may go while they are looked for."""
+    return sorted(Path(place, name) for place, _, names in os.walk(folder) for name in names if name == "result.json")
 
 
 def seen(paths):

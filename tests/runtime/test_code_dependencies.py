@@ -93,6 +93,17 @@ def test_tables_that_travel_with_a_module_count_with_it(package):
     )
 
 
+def test_a_comment_or_docstring_is_no_other_code(package):
+    path = package / "metrics" / "risk.py"
+    before = code_dependencies.digest_source(path)
+    source = path.read_text()
+    path.write_text(source.replace('"""', '"""Edited. ', 1) + "\n# edited\n")
+    assert code_dependencies.digest_source(path) == before
+    path.write_text(source + "\nEDITED = 1\n")
+    assert code_dependencies.digest_source(path) != before
+    path.write_text(source)
+
+
 def test_further_roots_count(package):
     config = {"method": {"_target_": "dhtorch.pipeline.method.Method"}}
     roots = {"roots": ["dhtorch.extract.dataset"], "code_dir": package}
