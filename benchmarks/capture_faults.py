@@ -14,7 +14,7 @@ A row is one window of frames, written in one layout with one fault, opened with
 * ``unchecked``: not right, no finding, but ``inspect`` states that the window cannot show the scale;
 * ``silent``: not right, without a word.
 
-Windows: the built-in room in every layout of ``dhtorch.testing.CAPTURE_WRITERS``, and frames of holo_a, two pieces of
+Windows: the built-in room in every layout of ``tests/support/writers``, and frames of holo_a, two pieces of
 7-Scenes and desk9 of the shared data in folders of numbered frames and as TUM. A fault *counts* where the window has
 3 cm of motion and 100 tracked near returns, where a lag moves the picture by 8 px of 640, and where the layout can show
 it: poses for their convention and for the factors 0.2 and 1.1 of the unit.
@@ -53,9 +53,12 @@ from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.testing import CAPTURE_WRITERS, CaptureWriter
 from dhtorch.validation import faults
 from dhtorch.validation.capture_check import check_capture
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support.writers import CAPTURE_WRITERS, CaptureWriter
 
 Frames = list[Frame]
 

@@ -19,7 +19,10 @@ from typing import NamedTuple
 
 from dhtorch import data
 from dhtorch.runtime import results as result_files
-from dhtorch.testing.lerobot import write_lerobot
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support.writers.lerobot import write_lerobot
 
 
 class Stream(NamedTuple):

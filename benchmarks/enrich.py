@@ -2,13 +2,13 @@
 
     python benchmarks/enrich.py --json benchmarks/results/enrich.json
 
-Real sets come from DHTORCH_DATA; formats of which none is there are written by ``dhtorch.testing`` with frames of the
-built-in room. Few frames each: FRAMES of every recording. A process each; what counts is its processor time, so that
-other work beside it matters little, less that of the same command once more, which finds everything done.
+Real sets come from DHTORCH_DATA; formats of which none is there are written by ``tests/support/writers`` with frames
+of the built-in room. Few frames each: FRAMES of every recording. A process each; what counts is its processor time,
+so that other work beside it matters little, less that of the same command once more, which finds everything done.
 
-``compared`` counts the values of the result that were held against the source's, one by one: pictures, depth where the
-sensor has one (within half a step), intrinsics, poses, columns, bytes of videos. What loaders of others make of the
-sets is in ``benchmarks/results/clients.json``, by the same names of source and target.
+``compared`` counts the values of the result that were held against the source's, one by one: pictures, depth where
+the sensor has one (within half a step), intrinsics, poses, columns, bytes of videos. What loaders of others make of
+the sets is in ``benchmarks/results/clients.json``, by the same names of source and target.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import data, testing
+from dhtorch import data
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.recording import Recording
 from dhtorch.extract.enriched import camera_key, to_rgb_uint8
@@ -38,9 +38,13 @@ from dhtorch.records import Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.testing.azure_kinect import write_azure_kinect
-from dhtorch.testing.rosbag import write_rosbag
-from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support import writers
+from support.writers.azure_kinect import write_azure_kinect
+from support.writers.rosbag import write_rosbag
+from support.writers.simulator_hdf5 import write_simulator_hdf5
 
 FRAMES, STEP = 3, 2.0**-10
 SHORT = (f"max_frames={FRAMES}", "dense={size: 160}")
@@ -73,15 +77,15 @@ def written(folder: Path) -> dict[str, tuple[Path, tuple[str, ...]]]:
     room = SyntheticRoom(hw=(72, 128), depth_hw=(72, 128), n_frames=4, supersample=1)
     frames = [room[i] for i in range(len(room))]
     makers: dict[str, Callable[[Path], Any]] = {
-        "stray": lambda p: testing.write_stray(p, frames),
-        "capture.r3d": lambda p: testing.write_r3d(p, frames),
-        "arkitscenes/1": lambda p: testing.write_arkitscenes(
+        "stray": lambda p: writers.write_stray(p, frames),
+        "capture.r3d": lambda p: writers.write_r3d(p, frames),
+        "arkitscenes/1": lambda p: writers.write_arkitscenes(
             p, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames
         ),
-        "ca1m/ca1m-val-1.tar": lambda p: testing.write_ca1m(p, frames, frames),
-        "rh20t": lambda p: testing.write_rh20t(p, {"036422060909": frames}),
-        "robot": lambda p: testing.write_lerobot(p, [frames, frames[:2]], depth="tiff"),
-        **{f"layouts/{name}": partial(testing.CAPTURE_WRITERS[name].write, frames=frames) for name in LAYOUTS},
+        "ca1m/ca1m-val-1.tar": lambda p: writers.write_ca1m(p, frames, frames),
+        "rh20t": lambda p: writers.write_rh20t(p, {"036422060909": frames}),
+        "robot": lambda p: writers.write_lerobot(p, [frames, frames[:2]], depth="tiff"),
+        **{f"layouts/{name}": partial(writers.CAPTURE_WRITERS[name].write, frames=frames) for name in LAYOUTS},
         "rosbag": lambda p: write_rosbag(p, frames),
         "azure_kinect.mkv": lambda p: write_azure_kinect(p, frames),
         "maniskill.h5": lambda p: write_simulator_hdf5(p, [frames, frames[:2]], "maniskill3"),

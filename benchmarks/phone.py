@@ -15,10 +15,10 @@ from pathlib import Path
 
 from captures import row
 
+from dhtorch.export.stray import write_stray
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.testing.stray import write_stray
 
 #: Size of a picture held upright, the way from frame to frame (0.3 m/s at ten frames a second), the reach.
 HW, STEP_M, RANGE_M = (1920, 1440), 0.03, 3.0

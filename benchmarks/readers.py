@@ -15,6 +15,7 @@ import math
 import multiprocessing
 import os
 import resource
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,15 +26,18 @@ from typing import Any
 import torch
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support import writers
+from support.writers import focal as stack_writers
 
 PERIOD = 20
 HW, LOW_HW = (480, 640), (192, 256)

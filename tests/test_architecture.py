@@ -21,7 +21,7 @@ FLOORS = (
     {"extract", "experiments"},
     {"transforms", "measure"},
     {"validation", "integrate", "synthetic"},
-    {"pipeline", "testing", "functional"},
+    {"pipeline", "functional"},
     {"calibration"},
     {"stages", "alignment", "metrics", "losses", "export", "data"},
     {"viz"},

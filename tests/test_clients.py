@@ -12,10 +12,10 @@ pytest.importorskip("pyarrow")
 
 from pyarrow import parquet
 from support.sample_dicts import room
+from support.writers import write_rlds
 
 from dhtorch.cli.run import main
 from dhtorch.functional.policy_inputs import NEAREST_M
-from dhtorch.testing import write_rlds
 
 CLIENTS = Path(__file__).resolve().parents[1] / "benchmarks" / "clients"
 ROOM = ["data=synthetic", "data.hw=[64,80]", "data.n_frames=4", "method=paper", "method.n=32", "method.hypotheses=8"]

@@ -59,7 +59,9 @@ def write_images(root: Path, room: Any) -> None:
     from pyarrow import array, parquet
 
     from dhtorch.export import lerobot
-    from dhtorch.testing import write_lerobot
+
+    sys.path.insert(0, str(README.parent / "tests"))
+    from support.writers import write_lerobot
 
     episodes = [[room[i] for i in range(k, k + 8)] for k in (0, 8)]
     write_lerobot(root, episodes, version=3, camera=CAMERA, image="image", depth="tiff", fps=FPS, poses=False)

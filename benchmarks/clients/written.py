@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,10 @@ from pyarrow import array, parquet
 from dhtorch.records import Frame
 from dhtorch.synthetic.robot import _solve_joints
 from dhtorch.synthetic.two_cameras import open_two_cameras
-from dhtorch.testing import write_lerobot, write_rlds
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+
+from support.writers import write_lerobot, write_rlds
 
 CAMERAS = ("observation.images.left", "observation.images.right")
 BASE = np.array([[0, -1, 0, 0], [0, 0, -1, 0.35], [1, 0, 0, -0.5], [0, 0, 0, 1.0]])  # world from base: z up, m

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from dhtorch.cli.view import has_screen
+from dhtorch.export.stray import write_stray
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.testing import write_stray
 
 #: Frames and size of the capture. Source: chosen for half a minute on a quiet machine; 8 frames took 40 s of processor
 #: time beside seventeen other processes on two cores.

@@ -1,11 +1,16 @@
-"""Helpers of the writers: tensors -> numpy arrays, colours -> uint8, and selection of finite points."""
+"""Helpers of the writers: tensors and frames -> numpy arrays, colours -> uint8, and selection of finite points."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
+
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame
 
 
 def to_numpy(x: Any) -> np.ndarray:
@@ -57,3 +62,46 @@ def rotation_to_wxyz(
 
     q = rotation_matrix_to_quaternion(R[None])[0]
     return (-q if q[0] < 0 else q).tolist()
+
+
+def rotation_to_xyzw(R: np.ndarray) -> np.ndarray:
+    """Rotation → quaternion x y z w: dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at any angle."""
+    d, s = R - R.T, R + R.T
+    Q = np.empty((4, 4))
+    Q[:3, :3] = s - np.trace(R) * np.eye(3)
+    Q[:3, 3] = Q[3, :3] = [d[2, 1], d[0, 2], d[1, 0]]
+    Q[3, 3] = np.trace(R)
+    return np.linalg.eigh(Q)[1][:, -1]
+
+
+def frame_to_hwc(frame: Frame) -> np.ndarray:
+    """Image of a frame (H, W, C) uint8."""
+    image = frame.image[0]
+    if image.dtype != torch.uint8:
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return image.permute(1, 2, 0).numpy()
+
+
+def encode_depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
+    """Depth (1, h, w) m → codes (h, w) uint16, C-contiguous."""
+    codes = (depth[0].double() * units_per_metre).round().clamp(0, 65534)
+    return np.ascontiguousarray(codes.numpy(), np.uint16)
+
+
+def K_matrix(camera: Camera) -> np.ndarray:
+    """Intrinsic matrix (3, 3) float64 of a camera."""
+    return cameras.to_matrix(camera)[0].double().numpy()
+
+
+def pose_matrix(frame: Frame) -> np.ndarray:
+    """Camera-to-world (4, 4) float64 of a frame."""
+    if frame.T_world_from_cam is None:
+        raise ValueError("writers: found a frame without T_world_from_cam, expected a pose to write")
+    return se3.to_matrix(frame.T_world_from_cam)[0].double().numpy()
+
+
+def frame_time_s(frame: Frame) -> float:
+    """Time stamp of a frame in s."""
+    if frame.time is None:
+        raise ValueError("writers: found a frame without time, expected a stamp to write")
+    return float(frame.time[0])

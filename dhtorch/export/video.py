@@ -1,8 +1,8 @@
-"""Writers of videos: lossless mp4 (H.264, RGB) that decodes to the same bytes, and small previews for players."""
+"""Writers of videos: lossless mp4 that decodes to the same bytes, small previews for players, films as phones write."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -79,3 +79,94 @@ def write_preview_video(path: Path, hw: tuple[int, int], pictures: Iterable[np.n
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
+
+
+#: Time base of a phone's film: divisible by 24, 25, 30 and 60 Hz.
+_TICKS_PER_S: Final = 600
+
+_H264: Final = {"qp": "0", "preset": "ultrafast"}
+# No B-frames: with them the muxer fails on videos of two frames, at some sizes always, at others sometimes.
+_HEVC: Final = {
+    "preset": "ultrafast", "x265-params": "lossless=1:bframes=0:log-level=none:pools=none:frame-threads=1"
+}  # fmt: skip
+
+#: Pixel format → encoder and lossless options.
+_LOSSLESS_ENCODERS: Final[dict[str, tuple[str, dict[str, str]]]] = {
+    "rgb24": ("libx264rgb", _H264),
+    "yuv420p": ("libx264", _H264),
+    "yuvj420p": ("libx264", _H264),
+    "gray12le": ("libx265", _HEVC),
+    "yuv420p12le": ("libx265", _HEVC),
+}
+
+
+def write_lossless(
+    file: Path,
+    pictures: Sequence[np.ndarray],  # (h, w, 3) or (h, w) uint8, or (h, w) uint16 of 12 bits; even sizes
+    pixels: str,
+    *,
+    rate: Fraction = Fraction(30),
+    options: Mapping[str, str] | None = None,
+) -> None:
+    """Write byte planes or coded depth as an mp4 in a pixel format of ``_LOSSLESS_ENCODERS``, bit by bit.
+
+    Images of one channel become the luma beside grey colour planes. ``options`` replace those of the encoder, for a
+    lossy file.
+    """
+    import av  # noqa: PLC0415
+
+    encoder, lossless = _LOSSLESS_ENCODERS[pixels]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(file), "w", format="mp4") as container:
+        stream: Any = container.add_stream(encoder, rate=rate, options=dict(lossless if options is None else options))
+        stream.pix_fmt = pixels
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.codec_context.thread_count = 1
+        for i, picture in enumerate(pictures):
+            frame = av.VideoFrame(picture.shape[1], picture.shape[0], pixels)
+            grey = 128 << 4 * (picture.itemsize - 1)
+            for k, plane in enumerate(frame.planes):
+                rows = np.full((plane.height, plane.line_size // picture.itemsize), grey, picture.dtype)
+                if k == 0:
+                    flat = picture.reshape(len(picture), -1)
+                    rows[:, : flat.shape[1]] = flat
+                plane.update(rows.tobytes())
+            frame.pts, frame.time_base = i, 1 / rate
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def write_video(
+    file: Path,
+    pictures: Sequence[np.ndarray],  # each (H, W, 3) uint8, even sizes
+    times: Sequence[float],  # s, increasing
+    *,
+    codec: str = "libx264",
+    crf: int = 10,
+    key_every: int = 12,
+    b_frames: int = 2,
+    stored: str = "yuv420p",
+) -> None:
+    """Write an mp4 with periodic key frames and B-frames (stored out of order), as phones write them.
+
+    ``codec``: ``libx264`` or ``libx265``. ``stored``: pixel format of the file; ``yuv420p10le`` has ten bits.
+    """
+    import av  # noqa: PLC0415
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(file), "w", format="mp4") as container:
+        rate = round(1 / (times[1] - times[0])) if len(times) > 1 else 30
+        stream: Any = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = stored
+        stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
+        stream.codec_context.thread_count = 1
+        stream.options = {"crf": str(crf), "g": str(key_every), "bf": str(b_frames)}
+        if codec == "libx265":
+            order = f"keyint={key_every}:bframes={b_frames}:log-level=none:pools=none:frame-threads=1"
+            stream.options = {"crf": str(crf), "x265-params": order}
+        for picture, time in zip(pictures, times, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = round((time - times[0]) * _TICKS_PER_S), Fraction(1, _TICKS_PER_S)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))

@@ -49,9 +49,9 @@ from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
 from dhtorch.records import Pose
 from dhtorch.synthetic.raycast import Material, Solid, Solids
 from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.rh20t import write_rh20t
 from dhtorch.synthetic.room import ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
 from dhtorch.synthetic.shading import ShadedRoom
-from dhtorch.testing.rh20t import write_rh20t
 
 #: Frames a second, as RH20T's cameras.
 _RATE_HZ = 10.0

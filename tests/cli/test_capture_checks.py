@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 from support import box_scene as box
-from support import textured_box
+from support import textured_box, writers
 from support.stated_poses import poses_of, state_poses, with_poses
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli import capture_checks, inspect, process_capture, recover_page
 from dhtorch.cli.capture_checks import check_data, check_scene, print_check
 from dhtorch.codes import Source

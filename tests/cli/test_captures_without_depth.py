@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support import writers
 from support.box_scene import walk
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data import FormatError
 from dhtorch.data.io import decode
 from dhtorch.synthetic.recording import SyntheticRoom

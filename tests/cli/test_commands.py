@@ -10,10 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from support import writers
 from support.tiny_runs import TINY
 
 import dhtorch
-from dhtorch import testing as writers
 from dhtorch.cli import commands, demo, process_capture, run
 from dhtorch.cli.commands import COMMANDS, list_options, resolve_option, to_overrides
 from dhtorch.runtime import console

@@ -16,10 +16,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
+from support import writers
 from support.processes import start, stop
 
 from dhtorch import MAP, data, export
-from dhtorch import testing as writers
 from dhtorch.cli import complete, layouts, run
 from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names

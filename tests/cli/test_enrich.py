@@ -14,11 +14,10 @@ pytest.importorskip("av")
 
 from PIL import Image
 from pyarrow import parquet
-from support import stored_outputs
+from support import stored_outputs, writers
 from support.dataset_folders import decode_map, read_files, read_rows
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.export.lerobot import FeatureMoments, LogHistogram
 from dhtorch.extract import shards

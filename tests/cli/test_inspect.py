@@ -19,18 +19,18 @@ import torch
 from PIL import Image
 from rich.console import Console
 from support import damage_harness as hostile
+from support import writers
 from support.box_scene import HW, pose, render
 from support.focal_stacks import random_stack
+from support.writers import focal as stack_writers
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli import inspect as capture
 from dhtorch.cli import run
 from dhtorch.data import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, report_depths, survey_recording
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose

@@ -7,9 +7,9 @@ import shutil
 from types import SimpleNamespace
 
 import pytest
+from support import writers
 from support.tiny_runs import TINY
 
-from dhtorch import testing as writers
 from dhtorch.cli import job, run, view
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import writers
 from support.source_trees import parsed
 from support.tiny_runs import ROOM, TINY
 
 import dhtorch
-from dhtorch import testing as writers
 from dhtorch.cli import inspect as capture
 from dhtorch.cli.run import EXIT_CODES, config_dir, job_name
 from dhtorch.experiments.report import page

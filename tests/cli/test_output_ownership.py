@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import writers
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli import run
 from dhtorch.metrics.holdout import range_split
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, is_private, open_output_folder

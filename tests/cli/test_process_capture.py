@@ -9,9 +9,8 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from support import stored_outputs
+from support import stored_outputs, writers
 
-from dhtorch import testing as writers
 from dhtorch.cli.completed_folder import count_pixels
 from dhtorch.cli.process_capture import order_evenly
 from dhtorch.cli.run import main

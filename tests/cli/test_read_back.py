@@ -12,8 +12,9 @@ import torch
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
+from support import writers
+
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.data import depth_maps
 from dhtorch.data.recording import Recording

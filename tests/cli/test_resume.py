@@ -16,9 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from support import writers
 from support.processes import start, stop
 
-from dhtorch import testing as writers
 from dhtorch.cli import job
 from dhtorch.cli.run import config_dir, job_name, main
 from dhtorch.experiments.protocol import Outcome

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import writers
 
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support import stored_outputs
+from support.writers.layouts import write_counted_frames
 
 from dhtorch.cli import run
 from dhtorch.measure import read_model
-from dhtorch.testing.layouts import write_counted_frames
 from tests.support import room_models as made
 from tests.support.byte_damage import change_middle, overwrite
 

@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support import stored_outputs
+from support import stored_outputs, writers
 from support.sample_dicts import SIDE, frames
 from torch.utils.data import DataLoader
 
-from dhtorch import testing as writers
 from dhtorch.cli import run, validate
 from dhtorch.cli.validate import (
     _deviation_lower_bound,

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, path, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
+from support.writers import parts
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli.run import config_dir
 from dhtorch.data import FormatError, clocks, convert
 from dhtorch.data.readers import arkitscenes, ca1m
@@ -25,7 +26,6 @@ from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.testing import parts
 
 
 def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from support.box_scene import CAMERA, render, walk
+from support.writers.azure_kinect import write_azure_kinect
 
 from dhtorch import data
 from dhtorch.data.codecs import matroska
@@ -21,7 +22,6 @@ from dhtorch.data.readers import azure_kinect
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.azure_kinect import write_azure_kinect
 
 pytest.importorskip("av")
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
 from support.ca1m_archives import ca1m_archive, ca1m_frames
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data import FormatError
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.readers import ca1m

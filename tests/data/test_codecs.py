@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.byte_damage import overwrite
+from support.writers.video import write_video
 
 from dhtorch.data.codecs import bag_messages, parquet
 from dhtorch.data.codecs import exr as codec_exr
@@ -26,7 +27,6 @@ from dhtorch.data.io.decode import FormatError, resolve_inside
 from dhtorch.data.readers import lerobot_meta
 from dhtorch.data.readers.lerobot_rows import read_row_table
 from dhtorch.data.units import DepthUnit
-from dhtorch.testing.mp4 import write_video
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")

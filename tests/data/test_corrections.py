@@ -5,10 +5,10 @@ import re
 import pytest
 import torch
 from support import box_scene as box
+from support import writers
 from support.stated_poses import poses_of, state_poses, with_poses
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data.corrections import Corrections
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording

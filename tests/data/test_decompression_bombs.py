@@ -18,15 +18,15 @@ import cv2
 import numpy as np
 import pytest
 from support import damage_harness as hostile
+from support import writers
 from support.box_scene import walk
+from support.writers.video import write_video
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data.codecs import hdf5, npy, parquet, pickles, tarballs, tiff, video
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.members import list_zip_members
-from dhtorch.testing.mp4 import write_video
 
 pyarrow = pytest.importorskip("pyarrow")
 tifffile = pytest.importorskip("tifffile")

@@ -6,10 +6,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from support import writers
 from support.box_scene import walk
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli import inspect
 from dhtorch.data import foreign_files
 from dhtorch.data.foreign_files import describe_foreign_file

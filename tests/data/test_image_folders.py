@@ -10,19 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support import writers
 from support.box_scene import CAMERA, HW, check_same, render, turned_back, walk
 from support.box_scene import pose as box_pose
+from support.writers import parts
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import open3d
 from dhtorch.data.units import DepthUnit
+from dhtorch.export import arrays
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
-from dhtorch.testing import parts
 
 EXACT = [name for name, w in writers.CAPTURE_WRITERS.items() if w.is_exact and w.step_m is not None and w.has_poses]
 #: Layouts of JPEGs, films or depth in metres.
@@ -181,11 +182,11 @@ def test_replica_finds_its_parameters_one_folder_above(tmp_path: Path) -> None:
 def test_replica_of_imap_states_neither_K_nor_unit(tmp_path: Path) -> None:
     frames = walk(3)
     for i, frame in enumerate(frames):
-        image = parts.encode_unfiltered_png(parts.frame_to_hwc(frame))
+        image = parts.encode_unfiltered_png(arrays.frame_to_hwc(frame))
         parts.save_file(tmp_path / "rgb" / f"rgb_{i}.png", image)
-        code = parts.encode_depth_codes(frame.depth, 1000)
+        code = arrays.encode_depth_codes(frame.depth, 1000)
         parts.save_file(tmp_path / "depth" / f"depth_{i}.png", parts.encode_unfiltered_png(code))
-    rows = [parts.format_row(parts.pose_matrix(frame).ravel()) for frame in frames]
+    rows = [parts.format_row(arrays.pose_matrix(frame).ravel()) for frame in frames]
     parts.save_file(tmp_path / "traj_w_c.txt", "\n".join(rows))
     recording = data.open(tmp_path, K=[61.5, 58.25, 33.5, 21.75])
     assert recording.format == "replica" and recording.depth_unit == DepthUnit(0.001)
@@ -438,7 +439,7 @@ def test_sun3d_codes_that_are_not_rotated_are_read_as_they_are(tmp_path: Path) -
     frames = walk(2)
     writers.write_sun3d(tmp_path, frames)
     for file, frame in zip(sorted((tmp_path / "depth").iterdir()), frames, strict=True):
-        file.write_bytes(parts.encode_unfiltered_png(parts.encode_depth_codes(frame.depth, 1000)))
+        file.write_bytes(parts.encode_unfiltered_png(arrays.encode_depth_codes(frame.depth, 1000)))
     recording = data.open(tmp_path)
     torch.testing.assert_close(recording[0].depth, frames[0].depth, atol=0.6e-3, rtol=0)
     assert recording.depth_unit == DepthUnit(0.001) and "not rotated by 3 bits" in recording.report[0]
@@ -457,19 +458,19 @@ def test_numbered_frames_with_rotated_codes(tmp_path: Path) -> None:
     frames = walk(2)
     writers.write_counted_frames(tmp_path, frames)
     for file, frame in zip(sorted((tmp_path / "depth").iterdir()), frames, strict=True):
-        file.write_bytes(parts.encode_unfiltered_png(rotated(parts.encode_depth_codes(frame.depth, 1000))))
+        file.write_bytes(parts.encode_unfiltered_png(rotated(arrays.encode_depth_codes(frame.depth, 1000))))
     assert float((data.open(tmp_path)[0].depth / frames[0].depth).median()) == pytest.approx(8, rel=0.01)
     check_same(data.open(tmp_path, rotated_bits=3), frames, 1e-3)
 
 
 def test_apc_scene_states_its_poses_in_one_file(tmp_path: Path) -> None:
     frames = [frame.replace(depth=frame.depth / 4) for frame in walk(2)]
-    titles = [("Color camera intrinsic matrix", parts.K_matrix(CAMERA)), ("Bin-to-world transformation", np.eye(4))]
+    titles = [("Color camera intrinsic matrix", arrays.K_matrix(CAMERA)), ("Bin-to-world transformation", np.eye(4))]
     for i, frame in enumerate(frames):
-        image, code = parts.frame_to_hwc(frame), parts.encode_depth_codes(frame.depth, 10000)
+        image, code = arrays.frame_to_hwc(frame), arrays.encode_depth_codes(frame.depth, 10000)
         parts.save_file(tmp_path / f"frame-{i:06d}.color.png", parts.encode_unfiltered_png(image))
         parts.save_file(tmp_path / f"frame-{i:06d}.depth.png", parts.encode_unfiltered_png(rotated(code)))
-        titles.append((f"Camera-to-world extrinsic matrix (camera pose) for frame-{i:06d}", parts.pose_matrix(frame)))
+        titles.append((f"Camera-to-world extrinsic matrix (camera pose) for frame-{i:06d}", arrays.pose_matrix(frame)))
     text = "".join(f"# {title}\n{parts.format_rows(matrix)}\n" for title, matrix in titles)
     (tmp_path / "cam.info.txt").write_text("# Environment: shelf\n" + text)
     recording = data.open(tmp_path)
@@ -572,7 +573,7 @@ def test_two_intrinsics_that_differ_are_named(tmp_path: Path) -> None:
     other = [[70, 0, 32], [0, 70, 24], [0, 0, 1]]
     (tmp_path / "meta.json").write_text(json.dumps({"K": other}))
     assert data.open(tmp_path).report == ("K.txt states another K than the one in use: f 61.5, c 33.5 21.75",)
-    (tmp_path / "meta.json").write_text(json.dumps({"K": other, "K_depth": parts.K_matrix(CAMERA).tolist()}))
+    (tmp_path / "meta.json").write_text(json.dumps({"K": other, "K_depth": arrays.K_matrix(CAMERA).tolist()}))
     assert data.open(tmp_path).report == ()
     assert data.open(tmp_path, K=[70, 70, 32, 24]).report == ()
 
@@ -583,7 +584,7 @@ def test_intrinsics_files_of_many_names_and_shapes(tmp_path: Path, name: str, n:
     writers.write_counted_frames(tmp_path, walk(1))
     (tmp_path / "K.txt").unlink()
     matrix = np.eye(4)
-    matrix[:3, :3] = parts.K_matrix(CAMERA)
+    matrix[:3, :3] = arrays.K_matrix(CAMERA)
     row = np.array([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]])
     (tmp_path / name).write_text(parts.format_rows(row if n == 1 else matrix[:n, :n]))
     recording = data.open(tmp_path)
@@ -599,7 +600,7 @@ def test_numbered_frames_with_a_pose_file_each(tmp_path: Path, folder: str) -> N
     writers.write_counted_frames(tmp_path, frames)
     (tmp_path / "poses.txt").unlink()
     for i, frame in enumerate(frames):
-        parts.save_file(tmp_path / folder / f"{i:05d}.txt", parts.format_rows(parts.pose_matrix(frame)))
+        parts.save_file(tmp_path / folder / f"{i:05d}.txt", parts.format_rows(arrays.pose_matrix(frame)))
     check_same(data.open(tmp_path), frames, 1e-3)
     (tmp_path / folder / "00001.txt").write_text("nan nan nan nan\n" * 4)
     (tmp_path / folder / "00002.txt").unlink()
@@ -617,8 +618,8 @@ def test_lost_poses_of_numbered_frames_are_left_out(tmp_path: Path, lost: str) -
     file = tmp_path / "poses.txt"
     lines = file.read_text().splitlines()
     if len(lost.split()) == 7:
-        matrices = [parts.pose_matrix(frame) for frame in frames]
-        lines = [parts.format_row([*T[:3, 3], *parts.rotation_to_xyzw(T[:3, :3])]) for T in matrices]
+        matrices = [arrays.pose_matrix(frame) for frame in frames]
+        lines = [parts.format_row([*T[:3, 3], *arrays.rotation_to_xyzw(T[:3, :3])]) for T in matrices]
     lines[1] = lost
     file.write_text("\n".join(lines))
     recording = data.open(tmp_path)

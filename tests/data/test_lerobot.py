@@ -22,6 +22,8 @@ pytest.importorskip("pyarrow")
 import av
 import pyarrow
 from pyarrow import parquet
+from support.writers.lerobot import quantise_lerobot_depth, write_lerobot
+from support.writers.video import write_video
 
 from dhtorch import data
 from dhtorch.cli import run
@@ -31,10 +33,8 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import lerobot_depth, lerobot_rows
 from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.data.units import DepthUnit
+from dhtorch.export.arrays import encode_depth_codes
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.lerobot import quantise_lerobot_depth, write_lerobot
-from dhtorch.testing.mp4 import write_video
-from dhtorch.testing.parts import encode_depth_codes
 
 KEY = "observation.images.front"
 STEP = {"video": 3e-3, "tiff": 1e-6, "png": 1e-3, "array": 1e-3}  # m, up to 5 m (codes: 2.8 mm there)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.writers.video import write_video
 from torch import Tensor
 
 from dhtorch import data
@@ -18,7 +19,6 @@ from dhtorch.data.codecs import video
 from dhtorch.data.io import decode as files
 from dhtorch.data.stored_sizes import StoredSizes, describe_mismatch
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.testing.mp4 import write_video
 
 ROOT = os.environ.get("DHTORCH_DATA")
 #: Capture → least number of its six frames in which the stored orientation wins alone.

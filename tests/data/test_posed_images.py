@@ -12,13 +12,14 @@ import pytest
 import torch
 from PIL import Image
 from support.box_scene import off_wall, walk, world_points
+from support.writers import write_colmap_capture, write_counted_frames, write_nerfstudio, write_polycam
+from support.writers.parts import encode_unfiltered_png
 
 from dhtorch import data
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.units import DepthUnit
+from dhtorch.export.arrays import encode_depth_codes
 from dhtorch.records import Camera, Frame
-from dhtorch.testing import write_colmap_capture, write_counted_frames, write_nerfstudio, write_polycam
-from dhtorch.testing.parts import encode_depth_codes, encode_unfiltered_png
 
 RIGID = np.array([[0.0, 1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, -1, 1.5], [0, 0, 0, 1]])  # as nerfstudio's of COLMAP
 

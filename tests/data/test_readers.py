@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from support import writers
 from support.box_scene import BOX, CAMERA, HW, check_same, disagreement, hit, off_wall, pose, render, walk, world_points
+from support.writers import parts
 from torch.utils.data import DataLoader
 
 from dhtorch import data, pytree
-from dhtorch import testing as writers
 from dhtorch.data import convert
 from dhtorch.data.codecs import npy
 from dhtorch.data.io import decode as files
@@ -27,11 +28,11 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import driving, frames_dir, rectified, tum
 from dhtorch.data.recording import consecutive_frame_numbers
 from dhtorch.data.scene import Scene
+from dhtorch.export import arrays
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
 from dhtorch.runtime import safe_open
-from dhtorch.testing import parts
 
 # ------------------------------------------------------------------------------------------------ written, then read
 
@@ -215,7 +216,7 @@ def test_quaternions_and_axes() -> None:
         q = np.append(np.sin(angle / 2) * axis / angle, np.cos(angle / 2))
         c2w = convert.to_c2w(3 * q[None], np.ones((1, 3)), Path("x"))[0]
         np.testing.assert_allclose(c2w[:3, :3], cv2.Rodrigues(axis)[0], atol=1e-12)
-        assert abs(parts.rotation_to_xyzw(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
+        assert abs(arrays.rotation_to_xyzw(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
     looking = convert.cv_from_gl(np.eye(4)[None])[0]
     np.testing.assert_array_equal(looking @ [0, 0, 1, 0], [0, 0, -1, 0])  # forward is −z in GL axes
     np.testing.assert_array_equal(looking @ [0, 1, 0, 0], [0, -1, 0, 0])  # down is −y

@@ -18,18 +18,18 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from support import writers
 from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
 from support.record3d_captures import DEPTH_HW, HW, camera_of, r3d_archive, rgbd_video, walk
 
 from dhtorch import data, pytree
-from dhtorch import testing as writers
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import record3d_video
 from dhtorch.data.readers.record3d_live import LiveFrames
+from dhtorch.export.stray import ARKIT_UP, turn_world
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
-from dhtorch.testing import parts
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")
@@ -49,7 +49,7 @@ def same_scene(recording: data.Recording, frames: list[Frame], relative: float =
         assert got.conf is None or torch.equal(got.conf, want.conf)
         assert float((got.image.float() - want.image.float()).abs().mean()) < 6  # JPEG
         assert float((got.time - (want.time - frames[0].time)).abs()) < 1e-9
-        T = parts.turn_world(want, parts.ARKIT_UP).T_world_from_cam
+        T = turn_world(want, ARKIT_UP).T_world_from_cam
         torch.testing.assert_close(got.T_world_from_cam.R, T.R, atol=1e-12, rtol=0)
         torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
         assert float(off_wall(world_points(own_camera(got))).max()) < 2 * relative + 1e-5

@@ -24,10 +24,10 @@ from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t, rh20t_robot, rh20t_set
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS, RobotStream
+from dhtorch.export.video import write_lossless
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
-from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.rh20t import to_robot_notation, write_rh20t
+from dhtorch.synthetic.rh20t import to_robot_notation, write_rh20t
 
 
 @pytest.fixture(autouse=True)

@@ -13,6 +13,7 @@ import pytest
 import torch
 from support.box_scene import HW
 from support.robot_episodes import three_episodes
+from support.writers import write_rlds
 
 from dhtorch import data
 from dhtorch.cli import inspect
@@ -21,10 +22,9 @@ from dhtorch.data.codecs import tfrecord
 from dhtorch.data.intrinsics import MissingIntrinsicsError
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rlds
+from dhtorch.export.arrays import encode_depth_codes
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.testing import write_rlds
-from dhtorch.testing.parts import encode_depth_codes
 
 ROOT = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "rlds_bridge" / "bridge_dataset" / "1.0.0"
 needs_data = pytest.mark.skipif(not ROOT.is_dir(), reason="DHTORCH_DATA has no rlds_bridge")
@@ -148,7 +148,7 @@ def test_no_records(content: bytes, said: str, tmp_path: Path) -> None:
 
 
 def test_whole_numbers_of_all_sizes(tmp_path: Path) -> None:
-    from dhtorch.testing.rlds import _encode_field, _int64s_feature  # noqa: PLC0415
+    from support.writers.rlds import _encode_field, _int64s_feature  # noqa: PLC0415
 
     values = [0, 1, -1, 127, 128, 300, 2**62, -(2**63), 2**63 - 1]
     body = _encode_field(1, _encode_field(1, _encode_field(1, b"x") + _encode_field(2, _int64s_feature(values))))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from support.box_scene import disagreement, off_wall, own_camera, render, walk, world_points
+from support.writers.rosbag import BagLayout, BagWriter, write_rosbag
 
 from dhtorch import data
 from dhtorch.data.codecs import ros_images, rosbag1
@@ -22,7 +23,6 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.testing.rosbag import BagLayout, BagWriter, write_rosbag
 
 pytest.importorskip("rosbags")
 

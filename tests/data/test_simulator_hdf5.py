@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from support.box_scene import walk
+from support.writers.simulator_hdf5 import write_simulator_hdf5
 
 from dhtorch import data
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import simulator_hdf5
 from dhtorch.records import Frame
-from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 
 h5py = pytest.importorskip("h5py")
 

@@ -12,19 +12,19 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from support import writers
 from support.box_scene import disagreement, off_wall, own_camera, pose, turned_over, world_points
 from support.stray_frames import DEPTH_HW, HW, camera_of, walk
 
 from dhtorch import data, pytree
-from dhtorch import testing as writers
 from dhtorch.data.clocks import FilmPairing
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import stray
+from dhtorch.export.stray import ARKIT_UP, turn_world
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
-from dhtorch.testing import parts
 
 pytest.importorskip("av")
 
@@ -40,7 +40,7 @@ def same_scene(recording: data.Recording, frames: list[Frame], image: float = 12
         torch.testing.assert_close(got.depth, want.depth, atol=STEP / 2 + 1e-6, rtol=0)
         assert torch.equal(got.conf, want.conf)
         torch.testing.assert_close(got.time, want.time, atol=1e-8, rtol=0)
-        T = parts.turn_world(want, parts.ARKIT_UP).T_world_from_cam
+        T = turn_world(want, ARKIT_UP).T_world_from_cam
         torch.testing.assert_close(got.T_world_from_cam.R, T.R, atol=1e-12, rtol=0)
         torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
         assert float(off_wall(world_points(own_camera(got))).max()) < 2 * STEP
@@ -181,7 +181,7 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     assert all(
         float((a.image.float() - b.float()).abs().mean()) < 6 for a, b in zip(recording, pictures[1:], strict=True)
     )
-    torch.testing.assert_close(recording.poses.t[:1], parts.turn_world(room[1], parts.ARKIT_UP).T_world_from_cam.t)
+    torch.testing.assert_close(recording.poses.t[:1], turn_world(room[1], ARKIT_UP).T_world_from_cam.t)
     other = data.open(tmp_path, lost_first=False)
     assert other.number.tolist() == list(range(8)) and "its last frame is lost (option lost_first)" in other.report[0]
 
@@ -229,7 +229,7 @@ def same_pictures(recording: data.Recording, frames: list[Frame], numbers: list[
         errors = [picture_error(got, frame) for frame in frames]
         assert errors[i] == min(errors) < 12
         torch.testing.assert_close(got.depth, frames[i].depth, atol=STEP / 2 + 1e-6, rtol=0)
-        T = parts.turn_world(frames[i], parts.ARKIT_UP).T_world_from_cam
+        T = turn_world(frames[i], ARKIT_UP).T_world_from_cam
         torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
 
 

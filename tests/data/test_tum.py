@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support import writers
 from support.box_scene import CAMERA, HW, check_same, pose, walk
+from support.writers import parts
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data.readers import tum
 from dhtorch.data.units import DepthUnit
+from dhtorch.export import arrays
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
-from dhtorch.testing import parts
 
 
 def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
@@ -106,7 +107,7 @@ def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path, sign: int) 
     writers.write_tum(tmp_path, walk(2))
     a, b = pose(0), pose(1)
     rows = [
-        f"{100 + s:.4f} " + parts.format_row([*T.t[0], *(q * parts.rotation_to_xyzw(T.R[0].numpy()))])
+        f"{100 + s:.4f} " + parts.format_row([*T.t[0], *(q * arrays.rotation_to_xyzw(T.R[0].numpy()))])
         for s, T, q in ((-0.004, a, 1), (0.012, b, sign))
     ]
     (tmp_path / "groundtruth.txt").write_text("# no camera named\n" + "\n".join(rows))

@@ -14,13 +14,13 @@ import pytest
 import tifffile
 import torch
 from support.focal_stacks import light_field, random_stack, texture
+from support.writers import focal as stack_writers
 
 from dhtorch import data
 from dhtorch.cli import run
 from dhtorch.data import FormatError
 from dhtorch.data.codecs import hdf5, npy, tiff
 from dhtorch.experiments.focal import ddff12, fod500, formats, image_folder
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.light_field import refocus
 from dhtorch.experiments.focal.stacks import FocalStacks
 

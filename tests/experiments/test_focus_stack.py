@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.writers import focal as stack_writers
 
 from dhtorch.experiments.focal import focus_stack as experiment
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.sharpness import (
     SHARPNESS_MEASURES,
     align_stack,

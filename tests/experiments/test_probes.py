@@ -18,6 +18,7 @@ import torch
 from support.byte_damage import change_middle
 from support.room_truth import room_distance
 from support.rooms import room_scene
+from support.writers.lerobot import write_lerobot
 
 from dhtorch import data
 from dhtorch.cli.run import main
@@ -36,7 +37,6 @@ from dhtorch.pipeline.presets import METHODS
 from dhtorch.runtime import results as result_files
 from dhtorch.synthetic import robot as synthetic_robot
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.testing.lerobot import write_lerobot
 from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth
 
 pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default

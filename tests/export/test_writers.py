@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support import writers
+from support.writers import focal as stack_writers
 from torch import Tensor
 
-from dhtorch import testing as writers
 from dhtorch.data.codecs import exr
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.stacks import FocalStack
+from dhtorch.export.video import write_lossless
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.testing.lossless import write_lossless
 
 HW = (16, 24)
 

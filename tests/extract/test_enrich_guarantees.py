@@ -23,10 +23,10 @@ pytest.importorskip("av")
 import pyarrow
 from PIL import Image
 from pyarrow import parquet
+from support import writers
 from support.dataset_folders import decode_map, read_files, read_rows
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli import capture_checks
 from dhtorch.cli.run import main
 from dhtorch.data.codecs import tfrecord

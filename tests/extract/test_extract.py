@@ -17,11 +17,11 @@ pytest.importorskip("av")
 import pyarrow
 from omegaconf import OmegaConf
 from pyarrow import parquet
+from support import writers
 from support.processes import start, stop
 
 import dhtorch
 from dhtorch import data, extract
-from dhtorch import testing as writers
 from dhtorch.cli.run import config_dir, main
 from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.geometry import camera as cam

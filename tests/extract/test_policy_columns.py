@@ -10,10 +10,10 @@ import torch
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
+from support import writers
 from support.dataset_folders import decode_map, read_rows
 
 from dhtorch import data, functional
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.codes import Cause, Source, names
 from dhtorch.data.codecs.video import read_video_frame, read_video_header, read_video_times

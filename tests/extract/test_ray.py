@@ -114,7 +114,8 @@ def test_a_killed_driver_resumes_with_another_engine(tmp_path):
 
 
 def test_a_corrupt_frame_and_a_missing_cluster_are_one_line(tmp_path):
-    from dhtorch import testing as writers  # noqa: PLC0415
+    from support import writers  # noqa: PLC0415
+
     from dhtorch.synthetic.recording import SyntheticRoom  # noqa: PLC0415
 
     room = SyntheticRoom(hw=(60, 80), n_frames=6, lidar="exact", supersample=1)

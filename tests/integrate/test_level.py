@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.writers import CAPTURE_WRITERS
 
 from dhtorch import MAP, data
 from dhtorch.data.recording import Recording
@@ -21,7 +22,6 @@ from dhtorch.integrate.level import (
 )
 from dhtorch.records import Pose
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.testing import CAPTURE_WRITERS
 
 GUESSES = torch.nn.functional.normalize(torch.randn(12, 3, dtype=torch.float64, generator=torch.manual_seed(0)), dim=-1)
 

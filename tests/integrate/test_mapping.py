@@ -11,10 +11,9 @@ import hydra
 import numpy as np
 import pytest
 import torch
-from support import stored_outputs
+from support import stored_outputs, writers
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.cli.run import config_dir, main
 from dhtorch.experiments import report
 from dhtorch.integrate import mapping

@@ -9,8 +9,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from support import writers
 
-from dhtorch import testing as writers
 from dhtorch.synthetic.recording import SyntheticRoom
 
 APP = Path(__file__).resolve().parents[2] / "integrations" / "space" / "app.py"

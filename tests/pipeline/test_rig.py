@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from support.box_scene import CAMERA, HW, pose, render
+from support.writers import write_lerobot
 from torch import Tensor
 
 from dhtorch import data
@@ -25,7 +26,6 @@ from dhtorch.pipeline.rig import ConstantPose, estimate_rig_pose
 from dhtorch.pytree import collate
 from dhtorch.records import Frame, Pose
 from dhtorch.synthetic import two_cameras
-from dhtorch.testing import write_lerobot
 from dhtorch.transforms import ExtendDepth
 
 TRUE = se3.invert(two_cameras._two_camera_pose(0.15, 3.0))

@@ -15,10 +15,10 @@ pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
 from pyarrow import parquet
+from support import writers
 from support.dataset_folders import read_files, read_rows
 from support.known_episodes import CAMERAS, LENS, episodes, pose, write_robot
 
-from dhtorch import testing as writers
 from dhtorch.cli import run
 from dhtorch.extract.enriched import MapRowDataset
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER

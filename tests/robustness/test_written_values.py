@@ -26,14 +26,13 @@ import av
 from PIL import Image
 from pyarrow import parquet
 from support import known_episodes as known
-from support import stored_outputs
+from support import stored_outputs, writers
 from support.known_episodes import CAMERAS, FPS, HW, LENGTHS, LENS, TASKS
+from support.writers.simulator_hdf5 import write_simulator_hdf5
 
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.codes import Gate, Hole, Source
 from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
-from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 from dhtorch.viz.viewer import html
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud, SweptPointCloud
 

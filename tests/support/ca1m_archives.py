@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dhtorch import testing as writers
 from dhtorch.records import Camera, Frame
+from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import CAMERA
 

@@ -12,16 +12,11 @@ import numpy as np
 import tifffile
 import torch
 
-from dhtorch import testing as writers
 from dhtorch.data.codecs import pickles, tiff
 from dhtorch.data.readers import rh20t
-from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
-from dhtorch.testing.azure_kinect import write_azure_kinect
-from dhtorch.testing.rosbag import BagLayout, write_rosbag
-from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
-from support import record3d_captures, stray_frames
+from support import record3d_captures, stray_frames, writers
 from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import walk
 from support.ca1m_archives import ca1m_archive
@@ -30,6 +25,10 @@ from support.focal_stacks import light_field, random_stack
 from support.pickled_values import plain_values
 from support.rh20t_frames import BASE, FIXED, HAND, moving, still
 from support.robot_episodes import three_episodes, two_episodes
+from support.writers import focal as stack_writers
+from support.writers.azure_kinect import write_azure_kinect
+from support.writers.rosbag import BagLayout, write_rosbag
+from support.writers.simulator_hdf5 import write_simulator_hdf5
 
 
 def small_walk(n: int = 3) -> list[Frame]:

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from pyarrow import parquet
 
-from dhtorch import testing as writers
 from dhtorch.records import Camera, Frame, Pose
+from support import writers
 
 HW, CAMERAS, LENGTHS, FPS = (48, 64), ("front", "wrist"), (10, 9), 20
 TASKS = ("pick up", "put down", "wait")

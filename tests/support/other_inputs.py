@@ -25,7 +25,6 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from dhtorch import calibration, export
-from dhtorch import testing as writers
 from dhtorch.cli import errors, pin
 from dhtorch.cli import run as commands
 from dhtorch.data.codecs.exr import read_exr
@@ -44,7 +43,7 @@ from dhtorch.measure.pin import CameraPin
 from dhtorch.runtime import results as result_files
 from dhtorch.stages.score import LearnedScore
 from dhtorch.viz.viewer.points import read_ply_exhibit
-from support import room_models
+from support import room_models, writers
 from support.captures_by_format import Sample, small_walk, write_lerobot_v2, write_lerobot_v3, write_tum
 from support.damage_harness import read_all
 from support.small_result import result

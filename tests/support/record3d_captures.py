@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from dhtorch import testing as writers
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
+from support import writers
 from support.box_scene import pose, render
 
 HW, DEPTH_HW = (48, 64), (24, 32)

@@ -8,8 +8,8 @@ pytest.importorskip("av")
 pytest.importorskip("pyarrow")
 
 from pyarrow import parquet
+from support import writers
 
-from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.data.rig import open_rig
 from dhtorch.runtime import results as result_files

@@ -21,13 +21,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
-from support import damage_harness
+from support import damage_harness, writers
 from support.room_truth import room_distance
 from support.rooms import Changed, room_scene
 from support.rooms import room as rendered
 
 from dhtorch import export
-from dhtorch import testing as writers
 from dhtorch.cli import run
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import by_choice, by_gap
@@ -480,7 +479,7 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
         "builtins.eval",
         "dhtorch.runtime.results.os.system",
         "dhtorch.data.io.decode.read_image",
-        "dhtorch.testing.write_tum",
+        "dhtorch.export.stray.write_stray",
         "dhtorch.data.os",
         "dhtorch.data.Path",
         "dhtorch.export.write_ply",

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from dhtorch.export.stray import ARKIT_UP, turn_world
 from dhtorch.records import Frame
-from dhtorch.testing import image_folders, layouts
-from dhtorch.testing.arkitscenes import write_arkitscenes
-from dhtorch.testing.ca1m import write_ca1m
-from dhtorch.testing.lerobot import write_lerobot
-from dhtorch.testing.parts import ARKIT_UP, turn_world
-from dhtorch.testing.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
-from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
-from dhtorch.testing.rlds import write_rlds
-from dhtorch.testing.stray import write_stray
+from support.writers import image_folders, layouts
+from support.writers.arkitscenes import write_arkitscenes
+from support.writers.ca1m import write_ca1m
+from support.writers.lerobot import write_lerobot
+from support.writers.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
+from support.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from support.writers.rlds import write_rlds
+from support.writers.stray import write_stray
 
 #: Range of depth of the Record3D film in m, which limits its step: 8 m in 1530 hues. Source: chosen for rooms.
 _MP4_RANGE_M = (0.0, 8.0)

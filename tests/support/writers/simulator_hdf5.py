@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 from dhtorch.data.io.decode import import_optional
+from dhtorch.export.arrays import K_matrix, frame_to_hwc, pose_matrix
 from dhtorch.records import Frame
-from dhtorch.testing.parts import K_matrix, frame_to_hwc, pose_matrix
 
 _CODES_PER_METRE = {"maniskill3": 1000, "maniskill2": 1024}
 

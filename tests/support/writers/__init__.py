@@ -5,10 +5,11 @@ They share no code with the decoders: PNG bytes, for example, are assembled here
 ``T_world_from_cam``.
 """
 
-from dhtorch.testing.arkitscenes import write_arkitscenes
-from dhtorch.testing.ca1m import write_ca1m
-from dhtorch.testing.captures import CAPTURE_WRITERS, CaptureWriter
-from dhtorch.testing.image_folders import (
+from dhtorch.synthetic.rh20t import write_rh20t
+from support.writers.arkitscenes import write_arkitscenes
+from support.writers.ca1m import write_ca1m
+from support.writers.captures import CAPTURE_WRITERS, CaptureWriter
+from support.writers.image_folders import (
     write_bop,
     write_icl_nuim,
     write_open3d,
@@ -18,7 +19,7 @@ from dhtorch.testing.image_folders import (
     write_sens_folder,
     write_sun3d,
 )
-from dhtorch.testing.layouts import (
+from support.writers.layouts import (
     write_calib_pair,
     write_counted_frames,
     write_driving,
@@ -26,12 +27,11 @@ from dhtorch.testing.layouts import (
     write_npz_pair,
     write_tum,
 )
-from dhtorch.testing.lerobot import write_lerobot
-from dhtorch.testing.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
-from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
-from dhtorch.testing.rh20t import write_rh20t
-from dhtorch.testing.rlds import write_rlds
-from dhtorch.testing.stray import write_stray
+from support.writers.lerobot import write_lerobot
+from support.writers.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
+from support.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from support.writers.rlds import write_rlds
+from support.writers.stray import write_stray
 
 __all__ = [
     "CAPTURE_WRITERS",

@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data.io.decode import import_optional
+from dhtorch.export.arrays import (
+    K_matrix,
+    encode_depth_codes,
+    frame_time_s,
+    frame_to_hwc,
+)
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.testing.parts import K_matrix, encode_depth_codes, frame_time_s, frame_to_hwc
 
 _TICKS_PER_S = 1000  # of the time base
 #: Depth mode by its size (height, width): (side of the binned sensor, crop at the left, crop at the top).

@@ -10,16 +10,16 @@ from typing import Any, Literal
 import numpy as np
 
 from dhtorch.data.io.decode import import_optional
-from dhtorch.records import Camera, Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
 )
+from dhtorch.records import Camera, Frame
+from support.writers.parts import encode_unfiltered_png
 
 #: Stored order of the channels of an encoding; others are written as they are.
 _CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 2), "bgra8": (2, 1, 0, 2), "mono8": (1,)}

@@ -17,19 +17,18 @@ import numpy as np
 from PIL import Image
 
 from dhtorch.data.io.decode import import_optional
-from dhtorch.geometry import camera as cameras
-from dhtorch.records import Frame
-from dhtorch.testing.mp4 import write_video
-from dhtorch.testing.parts import (
-    ARKIT_UP,
+from dhtorch.export.arrays import (
     K_matrix,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
-    save_file,
-    turn_world,
 )
+from dhtorch.export.stray import ARKIT_UP, turn_world
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Frame
+from support.writers.parts import save_file
+from support.writers.video import write_video
 
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 

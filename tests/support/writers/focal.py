@@ -12,7 +12,8 @@ from torch import Tensor
 
 from dhtorch.data.io.decode import import_optional
 from dhtorch.experiments.focal.stacks import FocalStack
-from dhtorch.testing.parts import encode_depth_codes, encode_unfiltered_png, save_file
+from dhtorch.export.arrays import encode_depth_codes
+from support.writers.parts import encode_unfiltered_png, save_file
 
 
 def write_fod500(root: Path, stacks: Mapping[int, FocalStack]) -> None:

@@ -14,17 +14,19 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from dhtorch.records import Camera, Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
-    format_row,
-    format_rows,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
+)
+from dhtorch.records import Camera, Frame
+from support.writers.parts import (
+    encode_unfiltered_png,
+    format_row,
+    format_rows,
     save_file,
 )
 

@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.records import Camera, Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
-    format_row,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
-    save_file,
 )
+from dhtorch.records import Camera, Frame
+from support.writers.parts import encode_unfiltered_png, format_row, save_file
 
 
 def write_arkitscenes(

@@ -9,18 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.records import Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
-    format_row,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
-    save_file,
 )
+from dhtorch.records import Frame
+from support.writers.parts import encode_unfiltered_png, format_row, save_file
 
 #: Change of camera axes from OpenCV (y down, z forward) to OpenGL (y up, z backward).
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])

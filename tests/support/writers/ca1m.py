@@ -10,17 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.export.tiff import encode_float_tiff
-from dhtorch.records import Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
-    save_file,
 )
+from dhtorch.export.tiff import encode_float_tiff
+from dhtorch.records import Frame
+from support.writers.parts import encode_unfiltered_png, save_file
 
 
 def write_ca1m(

@@ -11,19 +11,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame, Pose
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
-    format_row,
-    format_rows,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
+)
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame, Pose
+from support.writers.parts import (
+    encode_unfiltered_png,
+    format_row,
+    format_rows,
     save_file,
 )
 

@@ -13,17 +13,16 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data.io.decode import import_optional
-from dhtorch.export.tiff import encode_float_tiff
-from dhtorch.records import Frame
-from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
     frame_to_hwc,
     pose_matrix,
-    save_file,
 )
+from dhtorch.export.tiff import encode_float_tiff
+from dhtorch.export.video import write_lossless
+from dhtorch.records import Frame
+from support.writers.parts import encode_unfiltered_png, save_file
 
 _DEPTH_QUANTISATION = {"video.depth_min": 0.01, "video.depth_max": 10.0, "video.shift": 3.5, "video.use_log": True}
 _FILES_PER_CHUNK = 1000

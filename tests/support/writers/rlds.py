@@ -11,15 +11,14 @@ from typing import Any, Literal
 import numpy as np
 
 from dhtorch.data.codecs.tfrecord import crc32c, mask_crc
-from dhtorch.records import Frame
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
-    encode_unfiltered_png,
     frame_to_hwc,
     pose_matrix,
-    save_file,
 )
+from dhtorch.records import Frame
+from support.writers.parts import encode_unfiltered_png, save_file
 
 _FEATURES_CLASS = "tensorflow_datasets.core.features"
 

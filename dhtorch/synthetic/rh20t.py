@@ -1,4 +1,4 @@
-"""Test writer of RH20T scenes: videos by camera, a calibration folder, and the robot's streams."""
+"""Writer of RH20T scenes: videos by camera, a calibration folder, and the robot's streams."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
-from dhtorch.records import Frame
-from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.parts import (
+from dhtorch.export.arrays import (
     K_matrix,
     encode_depth_codes,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
     rotation_to_xyzw,
-    save_file,
 )
+from dhtorch.export.video import write_lossless
+from dhtorch.records import Frame
 
 _CALIBRATION_STAMP_MS = 1_600_000_000_000  # time of the calibration
 
@@ -65,7 +64,9 @@ def write_rh20t(
         write_lossless(camera_folder / "color.mp4", [frame_to_hwc(f) for f in frames], "rgb24", rate=Fraction(10))
         if depth:
             depth_file = (depth_root or scene) / camera_folder.name / "depth.mp4"
-            write_lossless(depth_file, [_encode_depth_planes(f) for f in frames], "yuvj420p", rate=Fraction(10))
+            codes = [encode_depth_codes(f.depth, 1000) for f in frames]  # low bytes above high bytes
+            planes = [np.concatenate((code & 255, code >> 8)).astype(np.uint8) for code in codes]
+            write_lossless(depth_file, planes, "yuvj420p", rate=Fraction(10))
         _save_npy(camera_folder / "timestamps.npy", {"color": stamps, "depth": depth_stamps if depth else []})
         K[serial] = np.hstack((_full_size_K(frames[0], calibrated_hw), np.zeros((3, 1))))
         poses = [pose_matrix(frame) for frame in frames]
@@ -85,7 +86,8 @@ def write_rh20t(
         _save_npy(scene / "transformed" / "tcp_base.npy", tcp)
     stamps_of = {s: [round(1000 * frame_time_s(f)) for f in fs] for s, fs in cameras.items()}
     _write_streams(scene / "transformed", stamps_of, joint, width)
-    save_file(scene / "metadata.json", json.dumps({"calib": stamp, "finish_time": stamp + 10**6, "rating": 9}))
+    about = {"calib": stamp, "finish_time": stamp + 10**6, "rating": 9}
+    (scene / "metadata.json").write_text(json.dumps(about), encoding="utf-8")
     return scene
 
 
@@ -115,12 +117,6 @@ def _pose_vector(T: np.ndarray) -> np.ndarray:
     """x y z qw qx qy qz."""
     q = rotation_to_xyzw(T[:3, :3])
     return np.array([*T[:3, 3], q[3], *q[:3]])
-
-
-def _encode_depth_planes(frame: Frame) -> np.ndarray:
-    """Depth codes as low bytes above high bytes (2h, w) uint8."""
-    code = encode_depth_codes(frame.depth, 1000)
-    return np.concatenate((code & 255, code >> 8)).astype(np.uint8)
 
 
 def _full_size_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
