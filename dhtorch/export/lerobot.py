@@ -347,32 +347,28 @@ def write_lerobot_meta(
             stat_rows = [{"episode_index": e.number, "stats": e.stats} for e in episodes]
             written.append(_write_json_lines(meta / "episodes_stats.jsonl", stat_rows))
     else:
-        columns = _make_episode_columns(episodes)
+        places = [divmod(e.number, FILES_PER_CHUNK) for e in episodes]
+        columns: dict[str, list[Any]] = {
+            "episode_index": [e.number for e in episodes],
+            "tasks": [list(e.tasks) for e in episodes],
+            "length": [e.length for e in episodes],
+            "data/chunk_index": [chunk for chunk, _ in places],
+            "data/file_index": [file for _, file in places],
+            "dataset_from_index": [e.start for e in episodes],
+            "dataset_to_index": [e.start + e.length for e in episodes],
+        }
+        for key in episodes[0].videos:
+            clips = [e.videos[key] for e in episodes]
+            ends = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+            columns |= {f"videos/{key}/{name}": list(x) for name, x in zip(ends, zip(*clips, strict=True), strict=True)}
+        zeros = [0] * len(episodes)
+        columns = columns | {"meta/episodes/chunk_index": zeros, "meta/episodes/file_index": zeros}
         written.append(_write_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
         numbered: dict[str, list[Any]] = {"task_index": list(range(len(tasks))), "task": list(tasks)}
         written.append(_write_table(meta / "tasks.parquet", numbered, index="task"))
     if stats is not None:
         written.append(storage.write_json(meta / "stats.json", stats))
     return [*written, storage.write_json(meta / "info.json", about)]
-
-
-def _make_episode_columns(episodes: Sequence[EpisodeSpec]) -> dict[str, list[Any]]:
-    places = [divmod(e.number, FILES_PER_CHUNK) for e in episodes]
-    columns: dict[str, list[Any]] = {
-        "episode_index": [e.number for e in episodes],
-        "tasks": [list(e.tasks) for e in episodes],
-        "length": [e.length for e in episodes],
-        "data/chunk_index": [chunk for chunk, _ in places],
-        "data/file_index": [file for _, file in places],
-        "dataset_from_index": [e.start for e in episodes],
-        "dataset_to_index": [e.start + e.length for e in episodes],
-    }
-    for key in episodes[0].videos:
-        clips = [e.videos[key] for e in episodes]
-        ends = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-        columns |= {f"videos/{key}/{name}": list(x) for name, x in zip(ends, zip(*clips, strict=True), strict=True)}
-    zeros = [0] * len(episodes)
-    return columns | {"meta/episodes/chunk_index": zeros, "meta/episodes/file_index": zeros}
 
 
 def _write_json_lines(path: Path, rows: Iterable[Any]) -> Path:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,7 +127,16 @@ def read(
     turns, c2w = 0, c2w[kept] if trajectory else c2w
     if upright and trajectory:
         turns = _count_quarter_turns(c2w, report)
-    load = _make_loader(name, pictures, links, kept, turns)
+    chosen = {what: tuple(link.stamped.files[j] for j in link.at[kept]) for what, link in links.items()}
+    load = _Load(
+        images=tuple(pictures.files[i] for i in kept),
+        pincams=chosen.get("intrinsics") or chosen["borrowed intrinsics"],
+        borrowed="intrinsics" not in chosen,
+        depths=chosen["depth"],
+        depth_pincams=chosen.get("intrinsics of the depth"),
+        confs=chosen.get("confidence"),
+        turns=turns,
+    )
     times = pictures.times[kept]
     fields: dict[str, Any] = {"name": _video_id(root), "format": "arkitscenes", "root": root, "load": load}
     fields |= {"number": torch.from_numpy(kept), "times": torch.from_numpy(times)}
@@ -137,8 +147,9 @@ def read(
     laser = _list_asset_files(places, ("highres_depth",), "png") if truth else None
     if laser is None:
         return [Recording(**fields, report=tuple(report))]
-    load_truth = _make_truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
-    if (n_without := load_truth.depths.count(None)) > 0:
+    depths, pincams = _match_laser(places, laser, times, max_truth_gap)
+    load_truth = partial(_load_truth, load=load, depths=depths, pincams=pincams, max_disagreement=max_disagreement)
+    if (n_without := depths.count(None)) > 0:
         missing = format_count(n_without, "frame")
         report.append(f"{missing} without laser depth within {max_truth_gap} s: no ground truth")
     return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
@@ -187,28 +198,27 @@ class _Load:
         return torch.from_numpy(files.read_depth_png(self.depths[i], _UNITS_PER_METRE, hw)), camera
 
 
-@dataclass(frozen=True, eq=False)
-class _LoadTruth:
+def _load_truth(
+    i: int,
+    *,
+    load: _Load,
+    depths: tuple[Path | None, ...],
+    pincams: tuple[Path | None, ...],  # None = the camera of the image, scaled
+    max_disagreement: float,
+) -> tuple[Tensor, float]:
     """Position → laser depth at the pixels of the image, and its disagreement with the LiDAR."""
-
-    load: _Load
-    depths: tuple[Path | None, ...]
-    pincams: tuple[Path | None, ...]  # None = the camera of the image, scaled
-    max_disagreement: float
-
-    def __call__(self, i: int) -> tuple[Tensor, float]:
-        (hw, camera), file, pincam = self.load.view(i), self.depths[i], self.pincams[i]
-        depth, disagreement = torch.zeros(hw), float("nan")
-        if file is not None:
-            laser_hw, laser_camera = (None, None) if pincam is None else _read_pincam(pincam)
-            laser = torch.from_numpy(files.read_depth_png(file, _UNITS_PER_METRE, laser_hw))
-            sensor, sensor_camera = self.load.sensor(i)
-            laser_camera = laser_camera or resize(camera, hw, (laser.shape[0], laser.shape[1]))
-            sensor_camera = sensor_camera or resize(camera, hw, (sensor.shape[0], sensor.shape[1]))
-            depth, disagreement = resample_laser_depth(
-                laser, laser_camera, sensor, sensor_camera, camera, hw, self.max_disagreement
-            )
-        return convert.rot90_image(depth, self.load.turns), disagreement
+    (hw, camera), file, pincam = load.view(i), depths[i], pincams[i]
+    depth, disagreement = torch.zeros(hw), float("nan")
+    if file is not None:
+        laser_hw, laser_camera = (None, None) if pincam is None else _read_pincam(pincam)
+        laser = torch.from_numpy(files.read_depth_png(file, _UNITS_PER_METRE, laser_hw))
+        sensor, sensor_camera = load.sensor(i)
+        laser_camera = laser_camera or resize(camera, hw, (laser.shape[0], laser.shape[1]))
+        sensor_camera = sensor_camera or resize(camera, hw, (sensor.shape[0], sensor.shape[1]))
+        depth, disagreement = resample_laser_depth(
+            laser, laser_camera, sensor, sensor_camera, camera, hw, max_disagreement
+        )
+    return convert.rot90_image(depth, load.turns), disagreement
 
 
 def _read_pincam(file: Path) -> tuple[tuple[int, int], Camera]:
@@ -343,31 +353,17 @@ def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: 
     return np.flatnonzero(keep)
 
 
-def _make_loader(
-    name: str, pictures: _AssetFiles, links: dict[str, _AssetMatch], kept: np.ndarray, turns: int
-) -> _Load:
-    chosen = {what: tuple(link.stamped.files[j] for j in link.at[kept]) for what, link in links.items()}
-    return _Load(
-        images=tuple(pictures.files[i] for i in kept),
-        pincams=chosen.get("intrinsics") or chosen["borrowed intrinsics"],
-        borrowed="intrinsics" not in chosen,
-        depths=chosen["depth"],
-        depth_pincams=chosen.get("intrinsics of the depth"),
-        confs=chosen.get("confidence"),
-        turns=turns,
-    )
-
-
-def _make_truth_loader(
-    places: Sequence[Path], laser: _AssetFiles, times: np.ndarray, load: _Load, max_gap: float, max_disagreement: float
-) -> _LoadTruth:
+def _match_laser(
+    places: Sequence[Path], laser: _AssetFiles, times: np.ndarray, max_gap: float
+) -> tuple[tuple[Path | None, ...], tuple[Path | None, ...]]:
+    """Laser depth and its intrinsics for each time, None where there are none."""
     at = nearest_stamps(times, laser.times, max_gap)
     depths = tuple(laser.files[j] if j >= 0 else None for j in at)
     pincams: tuple[Path | None, ...] = (None,) * len(at)
     if (wide := _list_asset_files(places, ("wide_intrinsics", "color_intrinsics"), "pincam")) is not None:
         own = nearest_stamps(laser.times[at], wide.times, _SAME_INSTANT_S)
         pincams = tuple(wide.files[k] if j >= 0 and k >= 0 else None for j, k in zip(at, own, strict=True))
-    return _LoadTruth(load, depths, pincams, max_disagreement)
+    return depths, pincams
 
 
 def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: float) -> tuple[np.ndarray, np.ndarray]:

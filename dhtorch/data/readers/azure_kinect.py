@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -124,7 +125,16 @@ def read(
         Recording(
             name=root.stem,
             format="azure_kinect",
-            load=_Load(root, tracks, pairs, hw, depth_hw, camera, calibration),
+            load=partial(
+                _load_frame,
+                file=root,
+                tracks=tracks,
+                pairs=pairs,
+                hw=hw,
+                depth_hw=depth_hw,
+                camera=camera,
+                calibration=calibration,
+            ),
             number=torch.from_numpy(pairs[:, 0].copy()),
             root=root,
             times=torch.from_numpy(times[0][pairs[:, 0]]),
@@ -151,26 +161,25 @@ class _Calibration:
     depth: _Lens
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    file: Path,
+    tracks: _Tracks,
+    pairs: np.ndarray,  # (n, 2) numbers of picture and depth map
+    hw: tuple[int, int],
+    depth_hw: tuple[int, int],
+    camera: Camera,
+    calibration: _Calibration | None,
+) -> Frame:
     """Position → frame."""
-
-    file: Path
-    tracks: _Tracks
-    pairs: np.ndarray  # (n, 2) numbers of picture and depth map
-    hw: tuple[int, int]
-    depth_hw: tuple[int, int]
-    camera: Camera
-    calibration: _Calibration | None
-
-    def __call__(self, i: int) -> Frame:
-        picture, depth_map = self.pairs[i].tolist()
-        image = video.read_video_frame(self.file, picture, self.hw, track=self.tracks.colour)
-        code = video.read_video_frame(self.file, depth_map, self.depth_hw, pixels="gray16le", track=self.tracks.depth)
-        depth = torch.from_numpy(files.to_metres(code, _UNITS_PER_METRE))
-        if self.calibration is not None:
-            depth = _register(depth, self.calibration, self.camera, self.hw)
-        return Frame(torch.from_numpy(image).permute(2, 0, 1).contiguous()[None], depth[None], self.camera)
+    picture, depth_map = pairs[i].tolist()
+    image = video.read_video_frame(file, picture, hw, track=tracks.colour)
+    code = video.read_video_frame(file, depth_map, depth_hw, pixels="gray16le", track=tracks.depth)
+    depth = torch.from_numpy(files.to_metres(code, _UNITS_PER_METRE))
+    if calibration is not None:
+        depth = _register(depth, calibration, camera, hw)
+    return Frame(torch.from_numpy(image).permute(2, 0, 1).contiguous()[None], depth[None], camera)
 
 
 def _register(depth: Tensor, calibration: _Calibration, camera: Camera, hw: tuple[int, int]) -> Tensor:

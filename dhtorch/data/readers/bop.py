@@ -9,6 +9,7 @@ recording each.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,9 @@ UNUSED_FILES = ("scene_gt*.json", "scene_gt_info*.json", "scene_gt_coco*.json")
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
-    sensors = [sensor for sensor in _list_sensors(root) if _find_images(root, sensor) is not None]
-    if not sensors:
-        return None
-    images = _find_images(root, sensors[0])
-    return f"{images.name if images else ''}/, depth{sensors[0]}/ and {_TABLE_STEM}{sensors[0]}.json"
+    for sensor, folder in _list_sensors(root).items():
+        return f"{folder.name}/, depth{sensor}/ and {_TABLE_STEM}{sensor}.json"
+    return None
 
 
 def read(
@@ -64,102 +63,68 @@ def read(
         FormatError: no image, no depth map, a damaged file, or values that are no camera or pose.
     """
     root = Path(root)
-    sensors = [sensor for sensor in _list_sensors(root) if _find_images(root, sensor) is not None]
+    sensors = _list_sensors(root)
     if not sensors:
         raise FormatError(root, "files", "none", "rgb/ or gray/ with scene_camera.json")
-    return [_read_sensor(root, sensor, intrinsics, K, fov, fps) for sensor in sensors]
+    return [_read_sensor(root, sensor, folder, (intrinsics, K, fov), fps) for sensor, folder in sensors.items()]
 
 
-def _list_sensors(root: Path) -> list[str]:
-    """Suffixes of ``scene_camera.json``: one empty, or ``_SENSOR`` of each sensor."""
+def _list_sensors(root: Path) -> dict[str, Path]:
+    """Suffix of ``scene_camera.json`` (empty, or ``_SENSOR`` of each sensor) → the folder of its images."""
     tables = sorted(root.glob(f"{_TABLE_STEM}*.json")) if root.is_dir() else []
-    return [table.stem.removeprefix(_TABLE_STEM) for table in tables]
-
-
-def _find_images(root: Path, sensor: str) -> Path | None:
-    return next((root / f"{kind}{sensor}" for kind in _IMAGE_KINDS if (root / f"{kind}{sensor}").is_dir()), None)
+    sensors = [table.stem.removeprefix(_TABLE_STEM) for table in tables]
+    folders = [[root / f"{kind}{sensor}" for kind in _IMAGE_KINDS] for sensor in sensors]
+    found = [next((folder for folder in places if folder.is_dir()), None) for places in folders]
+    return {sensor: folder for sensor, folder in zip(sensors, found, strict=True) if folder is not None}
 
 
 def _read_sensor(
     root: Path,
     sensor: str,
-    intrinsics: intrinsics_options.IntrinsicsOption | None,
-    K: Sequence[float] | None,
-    fov: float | None,
+    folder: Path,
+    options: tuple[intrinsics_options.IntrinsicsOption | None, Sequence[float] | None, float | None],
     fps: float | None,
 ) -> Recording:
-    table, folder = root / f"{_TABLE_STEM}{sensor}.json", _find_images(root, sensor) or root
-    entries = _read_entries(table)
-    images = image_table.list_numbered(folder, r"(\d+)\.(?:png|jpg|jpeg)")
-    depths = image_table.list_numbered(root / f"depth{sensor}", r"(\d+)\.png")
-    poses = {number: pose for number, entry in entries.items() if (pose := _parse_pose(entry, table)) is not None}
-    rows, report = image_table.pair_numbered(images, depths, poses)
-    report += files.format_left_out([row.number for row in rows if row.number not in entries], "no camera")
-    rows = [row for row in rows if row.number in entries]
-    if not rows:
-        count = f"{len(images)} images, {len(depths)} depth maps and {len(entries)} entries of {table.name}"
-        raise FormatError(root, "frames", count, f"images with the numbers of {folder.name}/, depth{sensor}/ and table")
-    hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
-    scales = {row.number: _parse_scale(entries[row.number], table) for row in rows}
-    stated = {row.number: _parse_K(entries[row.number], table) for row in rows}
-    first = rows[0].number
-    camera, guess = image_table.choose_camera(
-        root, hw, (stated[first], table, "cam_K"), intrinsics, K, fov, where=table.name
-    )
-    is_optional = any(option is not None for option in (intrinsics, K, fov))
-    cameras = dict.fromkeys(stated, camera) if is_optional else _make_cameras(stated, hw, table)
-    loader = image_table.ImageTableLoader(
-        rows=tuple(
-            image_table.ImageRow(
-                row.number, row.image, row.depth, row.c2w, cameras[row.number], _MM_PER_M / scales[row.number]
-            )
-            for row in rows
-        ),
-        hw=hw,
-        depth_hw=depth_hw,
-        camera=camera,
-        units_per_metre=_MM_PER_M / scales[first],
-    )
-    unit = DepthUnit(scales[first] / _MM_PER_M, f"{table.name}: depth_scale")
-    if len(set(scales.values())) > 1:
-        report.append(f"{table.name}: depth_scale differs from frame to frame: each frame is read by its own")
-    name = root.resolve().name + (f"/{sensor.removeprefix('_')}" if sensor else "")
-    return image_table.open_image_table(
-        root,
-        "bop",
-        loader,
-        unit=unit,
-        poses_file=table,
-        fps=fps,
-        report=[*report, *guess],
-        name=name,
-    )
-
-
-def _read_entries(table: Path) -> dict[int, dict[str, Any]]:
-    entries = {}
+    table = root / f"{_TABLE_STEM}{sensor}.json"
+    entries: dict[int, dict[str, Any]] = {}
     for key, entry in files.read_json(table).items():
         if not key.isdigit() or not isinstance(entry, dict):
             raise FormatError(table, f"entry {key}", entry, "an object, by the number of its image")
         entries[int(key)] = entry
-    return entries
-
-
-def _parse_scale(entry: dict[str, Any], table: Path) -> float:
-    return files.to_positive(entry.get("depth_scale"), table, "depth_scale")
-
-
-def _parse_K(entry: dict[str, Any], table: Path) -> np.ndarray:
-    return files.to_array(entry.get("cam_K"), (9,), table, "cam_K").reshape(3, 3)
-
-
-def _make_cameras(stated: dict[int, np.ndarray], hw: tuple[int, int], table: Path) -> dict[int, Camera]:
-    """Cameras by frame; equal matrices share one camera."""
-    by_value: dict[bytes, Camera] = {}
-    for matrix in stated.values():
-        if matrix.tobytes() not in by_value:
-            by_value[matrix.tobytes()] = convert.to_camera(matrix, hw, table, "cam_K")
-    return {number: by_value[matrix.tobytes()] for number, matrix in stated.items()}
+    images = image_table.list_numbered(folder, r"(\d+)\.(?:png|jpg|jpeg)")
+    depths = image_table.list_numbered(root / f"depth{sensor}", r"(\d+)\.png")
+    poses = {number: pose for number, entry in entries.items() if (pose := _parse_pose(entry, table)) is not None}
+    if not images.keys() & depths.keys() & entries.keys():
+        count = f"{len(images)} images, {len(depths)} depth maps and {len(entries)} entries of {table.name}"
+        raise FormatError(root, "frames", count, f"images with the numbers of {folder.name}/, depth{sensor}/ and table")
+    rows, report = image_table.pair_numbered(root, images, depths, poses)
+    report += files.format_left_out([row.number for row in rows if row.number not in entries], "no camera")
+    rows = [row for row in rows if row.number in entries]
+    scales = [files.to_positive(entries[row.number].get("depth_scale"), table, "depth_scale") for row in rows]
+    stated = [files.to_array(entries[row.number].get("cam_K"), (9,), table, "cam_K").reshape(3, 3) for row in rows]
+    cameras: dict[bytes, Camera] = {}  # equal matrices share one camera
+    if options == (None, None, None):
+        hw = files.read_image_header(rows[0].image).hw
+        cameras = {K.tobytes(): convert.to_camera(K, hw, table, "cam_K") for K in stated}
+    if len(set(scales)) > 1:
+        report.append(f"{table.name}: depth_scale differs from frame to frame: each frame is read by its own")
+    return image_table.open_image_table(
+        root,
+        "bop",
+        [
+            replace(row, camera=cameras.get(K.tobytes()), units_per_metre=_MM_PER_M / scale)
+            for row, K, scale in zip(rows, stated, scales, strict=True)
+        ],
+        options,
+        stated=(stated[0], table, "cam_K", None),
+        where=table.name,
+        units_per_metre=_MM_PER_M / scales[0],
+        unit=DepthUnit(scales[0] / _MM_PER_M, f"{table.name}: depth_scale"),
+        poses_file=table,
+        fps=fps,
+        report=report,
+        name=root.resolve().name + (f"/{sensor.removeprefix('_')}" if sensor else ""),
+    )
 
 
 def _parse_pose(entry: dict[str, Any], table: Path) -> np.ndarray | None:

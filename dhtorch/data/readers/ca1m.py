@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -90,23 +91,30 @@ def read(
         raise FormatError(root, "archives", "none", "ca1m-<split>-<video id>.tar")
     skip = {"wide/depth/confidence"} if confidence is None else set()
     skip |= set() if truth else {"gt/depth"}
-    return Recordings(
-        [archive.stem for archive in archives], _MakeRecording(tuple(archives), skip, confidence, max_disagreement)
+    open_archive = partial(
+        _open_archive, archives=tuple(archives), skip=skip, confidence=confidence, max_disagreement=max_disagreement
     )
+    return Recordings([archive.stem for archive in archives], open_archive)
 
 
-@dataclass(frozen=True)
-class _MakeRecording:
+def _open_archive(
+    i: int,
+    *,
+    archives: tuple[Path, ...],
+    skip: set[str],
+    confidence: str | None,
+    max_disagreement: float,
+) -> Recording:
     """Position → recording."""
-
-    archives: tuple[Path, ...]
-    skip: set[str]
-    confidence: str | None
-    max_disagreement: float
-
-    def __call__(self, i: int) -> Recording:
-        archive = self.archives[i]
-        return _make_recording(archive, _index_archive(archive, self.skip), self.confidence, self.max_disagreement)
+    archive = archives[i]
+    # (time in ns, member prefix) → member type → (offset, size); sorted by time
+    frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
+    for member in tarballs.iter_tar_members(archive):
+        match = _MEMBER_PATTERN.fullmatch(member.name)
+        if match and (what := match[3].lower()) in _KNOWN_MEMBERS - skip:
+            frame = frames.setdefault((int(match[2]), f"{match[1]}/{match[2]}"), {})
+            frame[what] = member.offset, member.size
+    return _make_recording(archive, dict(sorted(frames.items())), confidence, max_disagreement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,38 +158,25 @@ class _Load:
         return convert.to_camera(_parse_matrix(data, file, 3), hw, file, "K")
 
 
-@dataclass(frozen=True, eq=False)
-class _LoadTruth:
+def _load_truth(
+    i: int,
+    *,
+    load: _Load,
+    max_disagreement: float,
+) -> tuple[Tensor, float]:
     """Position → laser depth at the pixels of the image, and its disagreement with the LiDAR."""
-
-    load: _Load
-    max_disagreement: float
-
-    def __call__(self, i: int) -> tuple[Tensor, float]:
-        load = self.load
-        hw = files.decode_image_header(*load.member(i, "wide/image")).hw
-        if load.spans["gt/depth"][i, 0] < 0:
-            return torch.zeros(hw), float("nan")
-        camera = load.camera(i, "wide/image/k", hw)
-        maps, cameras = [], []
-        for what in ("gt/depth", "wide/depth"):
-            depth = load.depth(i, what)
-            intrinsics, size = load.spans.get(f"{what}/k"), (depth.shape[0], depth.shape[1])
-            has_own = intrinsics is not None and intrinsics[i, 0] >= 0
-            cameras.append(load.camera(i, f"{what}/k", size) if has_own else resize(camera, hw, size))
-            maps.append(depth)
-        return resample_laser_depth(maps[0], cameras[0], maps[1], cameras[1], camera, hw, self.max_disagreement)
-
-
-def _index_archive(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
-    """(time in ns, member prefix) → member type → (offset, size); sorted by time."""
-    frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
-    for member in tarballs.iter_tar_members(archive):
-        match = _MEMBER_PATTERN.fullmatch(member.name)
-        if match and (what := match[3].lower()) in _KNOWN_MEMBERS - skip:
-            frame = frames.setdefault((int(match[2]), f"{match[1]}/{match[2]}"), {})
-            frame[what] = member.offset, member.size
-    return dict(sorted(frames.items()))
+    hw = files.decode_image_header(*load.member(i, "wide/image")).hw
+    if load.spans["gt/depth"][i, 0] < 0:
+        return torch.zeros(hw), float("nan")
+    camera = load.camera(i, "wide/image/k", hw)
+    maps, cameras = [], []
+    for what in ("gt/depth", "wide/depth"):
+        depth = load.depth(i, what)
+        intrinsics, size = load.spans.get(f"{what}/k"), (depth.shape[0], depth.shape[1])
+        has_own = intrinsics is not None and intrinsics[i, 0] >= 0
+        cameras.append(load.camera(i, f"{what}/k", size) if has_own else resize(camera, hw, size))
+        maps.append(depth)
+    return resample_laser_depth(maps[0], cameras[0], maps[1], cameras[1], camera, hw, max_disagreement)
 
 
 def _make_recording(
@@ -220,7 +215,9 @@ def _make_recording(
         return Recording(**fields, report=tuple(report))
     if (n_without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
         report.append(f"{format_count(n_without, 'frame')} without gt/depth: no ground truth")
-    return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
+    return MeasuredRecording(
+        **fields, load_truth=partial(_load_truth, load=load, max_disagreement=max_disagreement), report=tuple(report)
+    )
 
 
 def _parse_matrix(data: bytes, file: Path, n: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,26 +92,25 @@ class _Shot:
     hw: tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    root: Path,
+    shots: tuple[_Shot, ...],
+    T_world_from_lidar: Pose,
+    T_world_from_cam: Pose,
+    cameras: tuple[Camera, ...],
+    crop_bottom: float,
+    hide_px: int,
+) -> Frame:
     """Position → frame."""
-
-    root: Path
-    shots: tuple[_Shot, ...]
-    T_world_from_lidar: Pose
-    T_world_from_cam: Pose
-    cameras: tuple[Camera, ...]
-    crop_bottom: float
-    hide_px: int
-
-    def __call__(self, i: int) -> Frame:
-        shot, camera = self.shots[i], self.cameras[i]
-        image = torch.from_numpy(files.read_image(self.root / shot.image, shot.hw))
-        T = se3.relative(self.T_world_from_lidar[i : i + 1], self.T_world_from_cam[i : i + 1])
-        xyz = se3.apply(T, torch.from_numpy(_read_sweep(self.root / shot.sweep, shot.fields))[None])
-        depth = convert.splat_depth(xyz[0], camera, shot.hw, self.hide_px)
-        rows = shot.hw[0] - round(self.crop_bottom * shot.hw[0])
-        return Frame(image[None, :, :rows].contiguous(), depth[None, :rows].contiguous(), camera)
+    shot, camera = shots[i], cameras[i]
+    image = torch.from_numpy(files.read_image(root / shot.image, shot.hw))
+    T = se3.relative(T_world_from_lidar[i : i + 1], T_world_from_cam[i : i + 1])
+    xyz = se3.apply(T, torch.from_numpy(_read_sweep(root / shot.sweep, shot.fields))[None])
+    depth = convert.splat_depth(xyz[0], camera, shot.hw, hide_px)
+    rows = shot.hw[0] - round(crop_bottom * shot.hw[0])
+    return Frame(image[None, :, :rows].contiguous(), depth[None, :rows].contiguous(), camera)
 
 
 def _make_recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
@@ -130,7 +130,15 @@ def _make_recording(scene: Path, name: str, shots: list[_Shot], report: list[str
     return Recording(
         name=f"{root.resolve().name}/{name}",
         format="driving",
-        load=_Load(root, tuple(complete), lidar, poses, cameras, **options),
+        load=partial(
+            _load_frame,
+            root=root,
+            shots=tuple(complete),
+            T_world_from_lidar=lidar,
+            T_world_from_cam=poses,
+            cameras=cameras,
+            **options,
+        ),
         number=torch.tensor([s.number for s in complete]),
         root=root,
         times=times,
@@ -158,7 +166,24 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
         for member, kind in zip(members, kinds, strict=True):
             if "image" in kind:
                 name = files.get_entry(member, "id.name", str, scene)
-                shot = _make_shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
+                image = kind["image"]
+                sweep = sweeps[0]
+                stamp = files.get_entry(member, "id.timestamp", str, scene)
+                try:
+                    seconds = datetime.fromisoformat(stamp).timestamp()
+                except (ValueError, OverflowError):
+                    raise FormatError(scene, "id.timestamp", stamp, "an ISO 8601 time") from None
+                shot = _Shot(
+                    number=number,
+                    stamp=seconds,
+                    image=_check_relative_path(files.get_entry(image, "filename", str, scene), scene),
+                    sweep=_check_relative_path(files.get_entry(sweep, "filename", str, scene), scene),
+                    fields=tuple(map(str, files.get_entry(sweep, "point_format", list, scene))),
+                    c2w=_parse_pose(image, scene),
+                    lidar_to_world=_parse_pose(sweep, scene),
+                    calibration=_check_relative_path(calibration, scene),
+                    hw=(files.get_entry(image, "height", int, scene), files.get_entry(image, "width", int, scene)),
+                )
                 of_camera = shots.setdefault(name, [])
                 if of_camera and of_camera[-1].number == number:
                     raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
@@ -166,27 +191,6 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
     if not shots:
         raise FormatError(scene, "samples", "no image", "instants with camera images")
     return shots
-
-
-def _make_shot(
-    scene: Path, member: dict[str, Any], image: dict[str, Any], sweep: dict[str, Any], *, number: int, calibration: str
-) -> _Shot:
-    stamp = files.get_entry(member, "id.timestamp", str, scene)
-    try:
-        seconds = datetime.fromisoformat(stamp).timestamp()
-    except (ValueError, OverflowError):
-        raise FormatError(scene, "id.timestamp", stamp, "an ISO 8601 time") from None
-    return _Shot(
-        number=number,
-        stamp=seconds,
-        image=_check_relative_path(files.get_entry(image, "filename", str, scene), scene),
-        sweep=_check_relative_path(files.get_entry(sweep, "filename", str, scene), scene),
-        fields=tuple(map(str, files.get_entry(sweep, "point_format", list, scene))),
-        c2w=_parse_pose(image, scene),
-        lidar_to_world=_parse_pose(sweep, scene),
-        calibration=_check_relative_path(calibration, scene),
-        hw=(files.get_entry(image, "height", int, scene), files.get_entry(image, "width", int, scene)),
-    )
 
 
 def _parse_pose(datum: dict[str, Any], scene: Path) -> np.ndarray:

@@ -202,7 +202,35 @@ def _single(root: Path) -> ImageRow | None:
 def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
     """(frames, poses or None, report of what was left out) of the layout that ``root`` has."""
     if (pictures := _find_image_folder(root)) is not None or (root / "images").is_dir():
-        return _list_counted_frames(root, pictures or root / "images")
+        folder = pictures or root / "images"
+        images, depths = list_images(folder), list_images(root / "depth")
+        file = _first_existing(root, _POSE_FILES)
+        rows = None if file is None else files.read_table(file)
+        if not images:
+            raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
+        # Rows have no names: they can be matched to images only if all counts are equal.
+        counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
+        for field, count in counts.items():
+            if count != len(images):
+                raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
+        if images.keys() != depths.keys():
+            unpaired = min(images.keys() ^ depths.keys())
+            raise FormatError(
+                root, "file names", f"{unpaired} in one of {folder.name}/ and depth/", "the same names in both"
+            )
+        stems = list(images)
+        digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
+        values = [int(m[1]) for m in digits if m]
+        increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
+        numbers = values if increasing else range(len(stems))
+        frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
+        source = file or _find_pose_folder(root, stems)
+        if source is None:
+            return frames, None, ["no poses.txt: no poses"]
+        poses = _read_pose_files(source, stems) if rows is None else _parse_poses(rows, source)
+        frames, report = split_lost([replace(frame, c2w=pose) for frame, pose in zip(frames, poses, strict=True)])
+        c2w = [frame.c2w for frame in frames if frame.c2w is not None]
+        return frames, convert.to_poses(np.stack(c2w), source) if c2w else None, report
     single = _single(root)
     return ([single], None, ["no poses in this layout"]) if single is not None else _list_named_frames(root)
 
@@ -239,37 +267,6 @@ def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[st
         for frame, matrix in zip(frames, poses, strict=True):
             convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
         raise
-
-
-def _list_counted_frames(root: Path, folder: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
-    images, depths = list_images(folder), list_images(root / "depth")
-    file = _first_existing(root, _POSE_FILES)
-    rows = None if file is None else files.read_table(file)
-    if not images:
-        raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
-    # Rows have no names: they can be matched to images only if all counts are equal.
-    counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
-    for field, count in counts.items():
-        if count != len(images):
-            raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
-    if images.keys() != depths.keys():
-        unpaired = min(images.keys() ^ depths.keys())
-        raise FormatError(
-            root, "file names", f"{unpaired} in one of {folder.name}/ and depth/", "the same names in both"
-        )
-    stems = list(images)
-    digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
-    values = [int(m[1]) for m in digits if m]
-    increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
-    numbers = values if increasing else range(len(stems))
-    frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
-    source = file or _find_pose_folder(root, stems)
-    if source is None:
-        return frames, None, ["no poses.txt: no poses"]
-    poses = _read_pose_files(source, stems) if rows is None else _parse_poses(rows, source)
-    frames, report = split_lost([replace(frame, c2w=pose) for frame, pose in zip(frames, poses, strict=True)])
-    c2w = [frame.c2w for frame in frames if frame.c2w is not None]
-    return frames, convert.to_poses(np.stack(c2w), source) if c2w else None, report
 
 
 def _find_pose_folder(root: Path, stems: Sequence[str]) -> Path | None:

@@ -25,6 +25,9 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import NO_DEPTH_CODES
 from dhtorch.records import Camera, Frame
 
+#: K of a camera, the file and the field that state it, and the image size (h, w) it is stated for; None = the images'.
+StatedK = tuple[np.ndarray, Path, str, tuple[int, int] | None]
+
 IMAGE_NAME_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)", re.IGNORECASE)
 
 #: Names of the images of layouts that number all files of a frame in one folder.
@@ -82,64 +85,49 @@ class ImageTableLoader:
         row = self.rows[i]
         camera = self.camera if row.camera is None else row.camera
         image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
-        depth = torch.from_numpy(self._read_depth(row))
-        depth_camera = self.depth_camera
+        units, bits = row.units_per_metre or self.units_per_metre, self.rotated_bits
+        if row.depth.suffix.lower() == _PGM_SUFFIX:
+            metres = files.to_metres(rotate_codes(pgm.read_pgm(row.depth, self.depth_hw), bits), units, self.no_return)
+        elif bits:
+            code = files.read_depth_png(row.depth, 1, self.depth_hw).astype(np.uint16)
+            metres = files.to_metres(rotate_codes(code, bits), units, self.no_return)
+        else:
+            metres = files.read_depth_png(row.depth, units, self.depth_hw, self.no_return)
+        depth, depth_camera = torch.from_numpy(metres), self.depth_camera
         if depth_camera is not None and self.register:
             depth, depth_camera = convert.register_depth(depth, depth_camera, camera, self.hw), None
         return Frame(image[None], depth[None], camera, depth_camera)
 
-    def _read_depth(self, row: ImageRow) -> np.ndarray:
-        units = self.units_per_metre if row.units_per_metre is None else row.units_per_metre
-        if self.rotated_bits == 0 and row.depth.suffix.lower() != _PGM_SUFFIX:
-            return files.read_depth_png(row.depth, units, self.depth_hw, self.no_return)
-        return files.to_metres(self._read_codes(row.depth), units, self.no_return)
-
-    def _read_codes(self, file: Path) -> np.ndarray:
-        if file.suffix.lower() == _PGM_SUFFIX:
-            code = pgm.read_pgm(file, self.depth_hw)
-        else:
-            code = files.read_depth_png(file, 1, self.depth_hw).astype(np.uint16)
-        return rotate_codes(code, self.rotated_bits)
-
 
 def read_stored_sizes(loader: ImageTableLoader) -> tuple[ImageTableLoader, StoredSizes]:
-    """The loader with the orientation tag of its first image, and what the files state of their orientation."""
+    """The loader with the orientation tag of its first image, and what the files state of their orientation.
+
+    Raises:
+        FormatError: depth maps lie turned by 90 degrees against the intrinsics of their own camera.
+    """
     exif = files.read_image_header(loader.rows[0].image).orientation
-    _refuse_turned_depth(loader)
-    depth_hw = loader.depth_hw if loader.depth_camera is None else None
+    depth_hw: tuple[int, int] | None = loader.depth_hw
+    if loader.depth_camera is not None:
+        c, (h, w), depth_hw = loader.depth_camera.c[0] + 0.5, loader.depth_hw, None
+        stated, turned = (float((c / c.new_tensor(size) - 0.5).abs().max()) for size in ((w, h), (h, w)))
+        if turned <= intrinsics_options.MAX_CENTRE_OFFSET and stated > 2 * intrinsics_options.MAX_CENTRE_OFFSET:
+            size = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
+            raise FormatError(loader.rows[0].depth, "size", size, "depth maps as their camera lies")
     return replace(loader, exif=exif), StoredSizes.of_images(loader.hw, depth_hw, exif)
 
 
-def _refuse_turned_depth(loader: ImageTableLoader) -> None:
-    """Raise if depth maps lie turned by 90 degrees against the intrinsics of their own camera."""
-    if loader.depth_camera is None:
-        return
-    c, (h, w) = loader.depth_camera.c[0] + 0.5, loader.depth_hw
-    stated, turned = (float((c / c.new_tensor(size) - 0.5).abs().max()) for size in ((w, h), (h, w)))
-    if turned <= intrinsics_options.MAX_CENTRE_OFFSET and stated > 2 * intrinsics_options.MAX_CENTRE_OFFSET:
-        size = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
-        raise FormatError(loader.rows[0].depth, "size", size, "depth maps as their camera lies")
+def choose_rotated_bits(file: Path, rotated: bool | None, whose: str) -> tuple[int, tuple[str, ...]]:
+    """Bits by which the codes of a format that rotates them to the left are rotated, and the remark where not.
 
-
-def are_codes_rotated(file: Path) -> bool:
-    """Whether the codes of a depth PNG are rotated to the left by 3 bits, as far as its returns show."""
-    code = files.read_depth_png(file, 1).astype(np.uint16)
-    returns = code[code > 0]
-    return returns.size == 0 or float((returns % 8 <= _MAX_LOW_BITS).mean()) >= _MIN_ROTATED
-
-
-def choose_rotated_bits(file: Path, rotated: bool | None, bits: int, whose: str) -> tuple[int, tuple[str, ...]]:
-    """Bits by which the codes of a format that rotates them are rotated, and the remark where they are not.
-
-    Args:
-        file: a depth map, which decides where ``rotated`` is None.
-        rotated: the reader's option.
-        bits: of the format.
-        whose: the format, for the remark.
+    ``rotated`` is the reader's option; None = as far as the returns of the depth PNG ``file`` show.
     """
-    if are_codes_rotated(file) if rotated is None else rotated:
-        return bits, ()
-    return 0, (f"depth codes are not rotated by {bits} bits, unlike {whose}: read unrotated (data.rotated=true)",)
+    if rotated is None:
+        code = files.read_depth_png(file, 1).astype(np.uint16)
+        returns = code[code > 0]
+        rotated = returns.size == 0 or float((returns % 8 <= _MAX_LOW_BITS).mean()) >= _MIN_ROTATED
+    if rotated:
+        return 3, ()
+    return 0, (f"depth codes are not rotated by 3 bits, unlike {whose}: read unrotated (data.rotated=true)",)
 
 
 def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
@@ -150,10 +138,16 @@ def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
 def open_image_table(
     root: Path,
     format: str,
-    loader: ImageTableLoader,
+    rows: Sequence[ImageRow],
+    options: tuple[intrinsics_options.IntrinsicsOption | None, Sequence[float] | None, float | None],
     *,
+    stated: StatedK | None,
+    where: str,
+    units_per_metre: float,
     unit: DepthUnit,
     poses_file: Path | None,
+    depth_stated: StatedK | None = None,
+    rotated_bits: int = 0,
     fps: float | None = None,
     report: Sequence[str] = (),
     name: str | None = None,
@@ -163,28 +157,39 @@ def open_image_table(
     Args:
         root: folder of the capture.
         format: name of the reader.
-        loader: of all rows, sorted by number.
-        unit: of the depth codes.
+        rows: at least one, sorted by number.
+        options: intrinsics, K and fov of the reader.
+        stated: K of the images in the capture, if any; options go before it.
+        where: the file that would hold it, for the error where K is missing.
+        units_per_metre: depth codes of one metre.
+        unit: of the depth codes, and what states it.
         poses_file: file or folder of the poses, for errors; None = no poses.
+        depth_stated: K of the depth maps where they have a camera of their own.
+        rotated_bits: bits by which the depth codes are rotated.
         fps: frame rate, for time stamps; None = no time stamps.
         report: of the reader.
         name: of the recording; None = the folder's.
 
     Raises:
-        FormatError: no row, or values that are no poses.
+        FormatError: no K, or values that are no cameras or poses.
     """
-    rows, lost = split_lost(loader.rows)
-    lines = [*report, *lost]
-    if not rows:
-        raise FormatError(root, "frames", "none with image, depth map and pose", "at least one")
-    poses = None
+    hw, depth_hw = files.read_image_header(rows[0].image).hw, read_depth_hw(rows[0].depth)
+    (image_K, scaled), (depth_K, depth_scaled) = (
+        fit_stated(each, size) for each, size in ((stated, hw), (depth_stated, depth_hw))
+    )
+    camera, guess = choose_camera(root, hw, image_K, *options, where=where)
+    depth_camera = None if depth_K is None else convert.to_camera(depth_K[0], depth_hw, *depth_K[1:])
+    rows, lost = split_lost(rows)
+    lines, poses = [*report, *scaled, *depth_scaled, *guess, *lost], None
     if all(row.c2w is not None for row in rows):
         poses = convert.to_poses(np.stack([row.c2w for row in rows if row.c2w is not None]), poses_file or root)
     else:
         lines.append("no poses")
     rate = None if fps is None else files.to_positive(fps, root, "option fps")
     number = torch.tensor([row.number for row in rows])
-    loader, stored = read_stored_sizes(replace(loader, rows=tuple(rows)))
+    loader, stored = read_stored_sizes(
+        ImageTableLoader(tuple(rows), hw, depth_hw, camera, depth_camera, units_per_metre, rotated_bits=rotated_bits)
+    )
     return Recording(
         name=name or root.resolve().name,
         format=format,
@@ -238,64 +243,64 @@ def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def pair_numbered(
-    images: Mapping[int, Path], depths: Mapping[int, Path], poses: Mapping[int, np.ndarray]
+    root: Path, images: Mapping[int, Path], depths: Mapping[int, Path], poses: Mapping[int, np.ndarray]
 ) -> tuple[list[ImageRow], list[str]]:
-    """Rows of the numbers that have an image and a depth map, and the report of the others."""
+    """Rows of the numbers that have an image and a depth map, and the report of the others.
+
+    Raises:
+        FormatError: no such number.
+    """
     both = sorted(images.keys() & depths.keys())
+    if not both:
+        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "the images' numbers")
     report = files.format_left_out(sorted(images.keys() - depths.keys()), "no depth map")
     report += files.format_left_out(sorted(depths.keys() - images.keys()), "no image")
     return [ImageRow(i, images[i], depths[i], poses.get(i)) for i in both], report
 
 
-def pair_folders(root: Path, images: Mapping[str, Path], depths: Mapping[str, Path], table: Path | None) -> ImagePairs:
-    """Images and depth maps of two folders, paired by a table of file names, equal names, or stamps in the names.
+def pair_folders(
+    root: Path, images: Mapping[str, Path], depths: Mapping[str, Path], table: Path | None
+) -> tuple[list[ImageRow], list[str]]:
+    """Rows of images and depth maps of two folders, numbered by the place of the image among all, and the report.
 
     Args:
         root: folder of the capture, for errors and the paths of ``table``.
         images, depths: by their names without suffix.
-        table: text file with the names of an image and of its depth map in each line, in any order; None = none.
+        table: text file with the names of an image and of its depth map in each line, in any order; None = none, the
+            names are equal or hold time stamps.
 
     Raises:
-        FormatError: a table with other names, or names that cannot be paired.
+        FormatError: a table with other names, names that cannot be paired, or no pair.
     """
     places = {stem: i for i, stem in enumerate(images)}
     if table is not None:
-        pairs = _read_pair_table(table, images, depths)
+        by_file = {(file.parent.name, file.name): ("image", stem) for stem, file in images.items()}
+        by_file |= {(file.parent.name, file.name): ("depth", stem) for stem, file in depths.items()}
+        pairs = []
+        for line, words in files.read_rows(table):
+            keys = [(Path(word).parent.name, Path(word).name) for word in words]
+            named = dict(by_file[key] for key in keys if key in by_file)
+            if named.keys() != {"image", "depth"}:
+                raise FormatError(table, f"line {line}", " ".join(words), "the names of an image and of its depth map")
+            pairs.append((named["image"], named["depth"]))
+        pairs = list({image: (image, depth) for image, depth in reversed(pairs)}.values())
     elif images.keys() & depths.keys():
         pairs = [(stem, stem) for stem in images if stem in depths]
     else:
-        pairs = _pair_stamped(root, images, depths)
+        pairs = _pair_stamped(root, list(images), list(depths))
+    if not pairs:
+        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "one for each image")
     paired = {stem for stem, _ in pairs}
     report = files.format_left_out([places[stem] for stem in images if stem not in paired], "no depth map")
     unused = len(depths) - len({stem for _, stem in pairs})
     if unused:
         report.append(f"{unused} depth map{'s' if unused > 1 else ''} without an image: left out")
-    rows = tuple(ImageRow(places[a], images[a], depths[b]) for a, b in sorted(pairs, key=lambda pair: places[pair[0]]))
-    return ImagePairs(rows, tuple(report))
+    pairs.sort(key=lambda pair: places[pair[0]])
+    return [ImageRow(places[a], images[a], depths[b]) for a, b in pairs], report
 
 
-@dataclass(frozen=True)
-class ImagePairs:
-    """Paired images and depth maps, numbered by the place of the image among all images, and what was left out."""
-
-    rows: tuple[ImageRow, ...]
-    report: tuple[str, ...]
-
-
-def _read_pair_table(table: Path, images: Mapping[str, Path], depths: Mapping[str, Path]) -> list[tuple[str, str]]:
-    by_file = {(file.parent.name, file.name): ("image", stem) for stem, file in images.items()}
-    by_file |= {(file.parent.name, file.name): ("depth", stem) for stem, file in depths.items()}
-    pairs = []
-    for line, words in files.read_rows(table):
-        named = dict(by_file[key] for word in words if (key := (Path(word).parent.name, Path(word).name)) in by_file)
-        if named.keys() != {"image", "depth"}:
-            raise FormatError(table, f"line {line}", " ".join(words), "the names of an image and of its depth map")
-        pairs.append((named["image"], named["depth"]))
-    return list({image: (image, depth) for image, depth in reversed(pairs)}.values())
-
-
-def _pair_stamped(root: Path, images: Mapping[str, Path], depths: Mapping[str, Path]) -> list[tuple[str, str]]:
-    stems = list(images), list(depths)
+def _pair_stamped(root: Path, *stems: list[str]) -> list[tuple[str, str]]:
+    """Pairs of names (of an image, of a depth map) whose time stamps are nearest."""
     stamps = []
     for named in stems:
         matches = [_STAMPED_NAME_PATTERN.fullmatch(stem) for stem in named]
@@ -361,15 +366,38 @@ def choose_camera(
     Raises:
         FormatError: no K, or no camera for an image of size ``hw``.
     """
-    option = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    if option.feature is not None:
-        expected = "fx fy cx cy, or degrees (the format has no features)"
-        raise FormatError(root, "option intrinsics", option.feature, expected)
+    option = parse_option(root, hw, intrinsics, K, fov)
     if option.K is not None:
         return convert.to_camera(convert.make_K(*option.K), hw, root, "option K"), option.report
     if stated is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, where)
     return convert.to_camera(stated[0], hw, *stated[1:]), ()
+
+
+def parse_option(
+    root: Path,
+    hw: tuple[int, int],
+    intrinsics: intrinsics_options.IntrinsicsOption | None,
+    K: Sequence[float] | None,
+    fov: float | None,
+) -> intrinsics_options.ParsedIntrinsics:
+    """The options of a format without features; raises where they name one."""
+    option = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
+    if option.feature is not None:
+        expected = "fx fy cx cy, or degrees (the format has no features)"
+        raise FormatError(root, "option intrinsics", option.feature, expected)
+    return option
+
+
+def fit_stated(
+    stated: StatedK | None, hw: tuple[int, int]
+) -> tuple[tuple[np.ndarray, Path, str] | None, tuple[str, ...]]:
+    """(K for images of size ``hw``, its file, its field), None where there is none, and the report of scaling."""
+    if stated is None:
+        return None, ()
+    K, file, field, stated_hw = stated
+    K, scaled = fit_K(K, stated_hw or hw, hw, file)
+    return (K, file, field), scaled
 
 
 def fit_K(

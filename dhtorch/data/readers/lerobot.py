@@ -11,8 +11,9 @@ videos have no code for *no return*, see :mod:`dhtorch.data.depth_codes`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -124,45 +125,65 @@ def read(
     meta, remarks = flag_unmarked_depth(meta, episodes[0], depth)
     episodes = replace(episodes, meta=meta)
     keys = select_colour_keys(meta, camera)
-    keys = keys if camera is not None else _recorded_cameras(keys, episodes)
-    rigs = [
-        _CameraSpec(
-            meta,
-            key,
-            depth,
-            intrinsics_options.parse_intrinsics(meta.root, meta.features[key].hw, intrinsics, K, fov),
-            K_depth,
-            distortion,
-            pose,
-            remarks,
-            span,
-            tolerance,
-            recovered,
+    if camera is None:  # a feature may be declared without data
+        videos = episodes[0].videos
+        keys = [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
+    rigs, columns = [], {*find_capture_columns(meta)}
+    for key in keys:
+        stated = intrinsics_options.parse_intrinsics(meta.root, meta.features[key].hw, intrinsics, K, fov)
+        K_key = None if stated.K is not None else _find_column(meta, key, stated.feature, "intrinsics")
+        own_key = f"observation.{key.split('.')[-1]}.T_world_from_cam"
+        pose_key = _find_column(meta, key, pose, "pose") or (own_key if own_key in meta.features else None)
+        columns |= {column for column in (K_key, pose_key) if column}
+        rigs.append(
+            partial(
+                _open_camera,
+                meta=meta,
+                key=key,
+                depth_key=depth,
+                stated=stated,
+                K_depth=K_depth,
+                distortion=distortion,
+                K_key=K_key,
+                pose_key=pose_key,
+                remarks=remarks,
+                span=span,
+                tolerance=tolerance,
+                recovered=recovered,
+            )
         )
-        for key in keys
-    ]
-    columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c} | {*find_capture_columns(meta)})
-    names = [rig.name(number) for number in episodes.numbers for rig in rigs]
-    return Recordings(names, _MakeRecording(episodes, tuple(rigs), tuple(columns)))
+    names = [_name(meta, key, number) for number in episodes.numbers for key in keys]
+    return Recordings(
+        names, partial(_make_recording, episodes=episodes, rigs=tuple(rigs), columns=tuple(sorted(columns)))
+    )
 
 
-def _recorded_cameras(keys: list[str], episodes: LeRobotEpisodes) -> list[str]:
-    """Keys of the cameras whose videos exist; a feature may be declared without data."""
-    videos = episodes[0].videos
-    return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
+def _name(meta: LeRobotMeta, key: str, episode: int) -> str:
+    return f"{meta.name}/episode_{episode:06d}/{key.rsplit('.', maxsplit=1)[-1]}"
 
 
-@dataclass(frozen=True, eq=False)
-class _MakeRecording:
+def _find_column(meta: LeRobotMeta, key: str, option: str | None, what: str) -> str | None:
+    """The feature of the option, else the one named for ``what`` of the camera; None where there is none."""
+    if option is not None:
+        if option not in meta.features:
+            raise FormatError(meta.root, f"option {what}", option, f"one of {', '.join(meta.features)}")
+        return option
+    camera = key.rsplit(".", maxsplit=1)[-1]
+    above = f"observation.camera.{camera}", f"observation.{camera}"
+    names = (f"{key}.{what}", *(f"{name}.{what}" for name in above), f"observation.{what}.{camera}")
+    return next((name for name in names if name in meta.features), None)
+
+
+def _make_recording(
+    i: int,
+    *,
+    episodes: LeRobotEpisodes,
+    rigs: tuple[Callable[..., Recording], ...],
+    columns: tuple[str, ...],  # further columns of the tables to read
+) -> Recording:
     """Position → recording: the cameras of the first episode, then those of the second, …"""
-
-    episodes: LeRobotEpisodes
-    rigs: tuple[_CameraSpec, ...]
-    columns: tuple[str, ...]  # further columns of the tables to read
-
-    def __call__(self, i: int) -> Recording:
-        episode = self.episodes[i // len(self.rigs)]
-        return self.rigs[i % len(self.rigs)].recording(episode, read_row_table(episode.data, self.columns))
+    episode = episodes[i // len(rigs)]
+    return rigs[i % len(rigs)](episode, read_row_table(episode.data, columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,127 +265,104 @@ class _Load:
         return read_encoded_image(self.data, self.root, key, int(self.rows[i]))
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraSpec:
-    """One camera of the data set with its features and options."""
+def _open_camera(
+    episode: LeRobotEpisode,
+    table: dict[str, np.ndarray],
+    *,
+    meta: LeRobotMeta,
+    key: str,
+    depth_key: str | None,
+    stated: intrinsics_options.ParsedIntrinsics,
+    K_depth: Sequence[float] | None,
+    distortion: Sequence[float] | None,
+    K_key: str | None,  # feature with K; None where K comes from elsewhere
+    pose_key: str | None,
+    remarks: tuple[str, ...],  # about the data set, for the report
+    span: tuple[float, float],
+    tolerance: float,
+    recovered: bool,
+) -> Recording:
+    """The recording of a camera in an episode."""
+    image = meta.features[key]
+    rows, numbers, times, report = select_episode_rows(meta, episode, table)
+    report += stated.report
+    report += remarks
+    depth = find_depth_feature(meta, key, depth_key)
+    unit = None if depth is None else find_depth_unit(meta, depth, episode, int(rows[0]))
+    if depth is None:
+        report.append(f"{key}: no depth feature: depth is empty")
+    origin = None if recovered or depth is None else find_origin_feature(meta, key, depth)
+    if origin is not None:
+        report.append("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)")
+    videos = {f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"}
+    has_picture, pictures, unpaired = pair_episode_videos(videos, numbers, times, tolerance)
+    rows, numbers, times, report = rows[has_picture], numbers[has_picture], times[has_picture], report + unpaired
+    values = None if K_key is None else table[K_key][rows]
+    cameras, depth_camera = _read_cameras(meta, key, (K_key, values), depth, stated, options=(K_depth, distortion))
+    poses = None
+    if pose_key is not None:
+        poses = convert.parse_poses(table[pose_key][rows], episode.data, pose_key)
+    load = _Load(
+        data=episode.data,
+        root=meta.root,
+        rows=rows,
+        times=times,
+        image=image,
+        depth=depth,
+        videos=videos,
+        cameras=cameras,
+        depth_camera=depth_camera,
+        step_m=None if unit is None else unit.metres,
+        span=span,
+        tolerance=tolerance,
+        pictures=pictures,
+        origin=origin,
+    )
+    numbers, clock = read_capture_clock(meta, table, rows, numbers, times)
+    return Recording(
+        name=_name(meta, key, episode.number),
+        format="lerobot",
+        load=load,
+        number=torch.from_numpy(numbers),
+        root=meta.root,
+        times=None if clock is None else torch.from_numpy(clock),
+        poses=poses,
+        rate_hz=None if clock is None else meta.fps,
+        report=tuple(report),
+        episode=episode.number,
+        camera_name=key,
+        depth_unit=unit,
+        stored=StoredSizes(image.hw, None if depth is None or depth_camera is not None else depth.hw),
+    )
 
-    meta: LeRobotMeta
-    key: str
-    depth_key: str | None
-    stated: intrinsics_options.ParsedIntrinsics
-    K_depth: Sequence[float] | None
-    distortion: Sequence[float] | None
-    pose: str | None
-    remarks: tuple[str, ...]  # about the data set, for the reports
-    span: tuple[float, float]
-    tolerance: float
-    recovered: bool
 
-    @property
-    def image(self) -> LeRobotFeature:
-        return self.meta.features[self.key]
-
-    @property
-    def K_key(self) -> str | None:
-        """Key of the feature with K; None where K comes from elsewhere."""
-        return None if self.stated.K is not None else self._column(self.stated.feature, "intrinsics")
-
-    @property
-    def pose_key(self) -> str | None:
-        key = self._column(self.pose, "pose")
-        own_key = f"observation.{self.key.split('.')[-1]}.T_world_from_cam"
-        return own_key if key is None and own_key in self.meta.features else key
-
-    def _column(self, option: str | None, what: str) -> str | None:
-        if option is not None:
-            if option not in self.meta.features:
-                raise FormatError(self.meta.root, f"option {what}", option, f"one of {', '.join(self.meta.features)}")
-            return option
-        camera = self.key.split(".")[-1]
-        above = f"observation.camera.{camera}", f"observation.{camera}"
-        names = (f"{self.key}.{what}", *(f"{name}.{what}" for name in above), f"observation.{what}.{camera}")
-        return next((name for name in names if name in self.meta.features), None)
-
-    def name(self, episode: int) -> str:
-        """Name of the recording of an episode."""
-        return f"{self.meta.name}/episode_{episode:06d}/{self.key.split('.')[-1]}"
-
-    def recording(self, episode: LeRobotEpisode, table: dict[str, np.ndarray]) -> Recording:
-        meta, image = self.meta, self.image
-        rows, numbers, times, report = select_episode_rows(meta, episode, table)
-        report += self.stated.report
-        report += self.remarks
-        depth = find_depth_feature(meta, self.key, self.depth_key)
-        unit = None if depth is None else find_depth_unit(meta, depth, episode, int(rows[0]))
-        if depth is None:
-            report.append(f"{self.key}: no depth feature: depth is empty")
-        origin = None if self.recovered or depth is None else find_origin_feature(meta, self.key, depth)
-        if origin is not None:
-            report.append("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)")
-        videos = {f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"}
-        has_picture, pictures, remarks = pair_episode_videos(videos, numbers, times, self.tolerance)
-        rows, numbers, times, report = rows[has_picture], numbers[has_picture], times[has_picture], report + remarks
-        cameras, depth_camera = self._cameras(table, rows, depth)
-        poses = None
-        if self.pose_key is not None:
-            poses = convert.parse_poses(table[self.pose_key][rows], episode.data, self.pose_key)
-        load = _Load(
-            data=episode.data,
-            root=meta.root,
-            rows=rows,
-            times=times,
-            image=image,
-            depth=depth,
-            videos=videos,
-            cameras=cameras,
-            depth_camera=depth_camera,
-            step_m=None if unit is None else unit.metres,
-            span=self.span,
-            tolerance=self.tolerance,
-            pictures=pictures,
-            origin=origin,
-        )
-        numbers, clock = read_capture_clock(meta, table, rows, numbers, times)
-        return Recording(
-            name=self.name(episode.number),
-            format="lerobot",
-            load=load,
-            number=torch.from_numpy(numbers),
-            root=meta.root,
-            times=None if clock is None else torch.from_numpy(clock),
-            poses=poses,
-            rate_hz=None if clock is None else meta.fps,
-            report=tuple(report),
-            episode=episode.number,
-            camera_name=self.key,
-            depth_unit=unit,
-            stored=StoredSizes(image.hw, None if depth is None or depth_camera is not None else depth.hw),
-        )
-
-    def _cameras(
-        self, table: dict[str, np.ndarray], rows: np.ndarray, depth: LeRobotFeature | None
-    ) -> tuple[Camera, Camera | None]:
-        root, hw = self.meta.root, self.image.hw
-        side_car = root / "meta" / "intrinsics.json"
-        entry = files.read_json(side_car).get(self.key, {}) if side_car.is_file() else {}
-        if not isinstance(entry, dict):
-            raise FormatError(side_car, self.key, type(entry).__name__, "an object with K")
-        distortion = self.distortion if self.distortion is not None else entry.get("dist")
-        depth_camera = None
-        if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
-            value = (
-                convert.parse_K_option(self.K_depth, root, "option K_depth")
-                if self.K_depth is not None
-                else entry["K_depth"]
-            )
-            depth_camera = convert.to_camera(value, depth.hw, side_car, "K_depth")
-        if self.stated.K is not None:
-            K = convert.make_K(*self.stated.K)
-            return convert.to_camera(K, hw, root, "option K", distortion), depth_camera
-        if self.K_key is not None:
-            values = table[self.K_key][rows]
-            return convert.to_cameras(values, hw, root / "data", self.K_key, distortion), depth_camera
-        if "K" not in entry:
-            others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
-            raise intrinsics_options.missing_intrinsics_error(root, self.key, *others, depth=depth is not None)
-        return convert.to_camera(entry["K"], hw, side_car, f"{self.key} K", distortion), depth_camera
+def _read_cameras(
+    meta: LeRobotMeta,
+    key: str,
+    column: tuple[str | None, np.ndarray | None],  # feature with K and its values in the rows
+    depth: LeRobotFeature | None,
+    stated: intrinsics_options.ParsedIntrinsics,
+    *,
+    options: tuple[Sequence[float] | None, Sequence[float] | None],  # K_depth, distortion
+) -> tuple[Camera, Camera | None]:
+    """Camera of the image (n, or 1 for all) and of a depth map with a K of its own."""
+    (K_depth, distortion), root, hw = options, meta.root, meta.features[key].hw
+    side_car = root / "meta" / "intrinsics.json"
+    entry = files.read_json(side_car).get(key, {}) if side_car.is_file() else {}
+    if not isinstance(entry, dict):
+        raise FormatError(side_car, key, type(entry).__name__, "an object with K")
+    distortion = distortion if distortion is not None else entry.get("dist")
+    depth_camera = None
+    if depth is not None and (K_depth is not None or entry.get("K_depth") is not None):
+        value = convert.parse_K_option(K_depth, root, "option K_depth") if K_depth is not None else entry["K_depth"]
+        depth_camera = convert.to_camera(value, depth.hw, side_car, "K_depth")
+    if stated.K is not None:
+        K = convert.make_K(*stated.K)
+        return convert.to_camera(K, hw, root, "option K", distortion), depth_camera
+    name, values = column
+    if name is not None and values is not None:
+        return convert.to_cameras(values, hw, root / "data", name, distortion), depth_camera
+    if "K" not in entry:
+        others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
+        raise intrinsics_options.missing_intrinsics_error(root, key, *others, depth=depth is not None)
+    return convert.to_camera(entry["K"], hw, side_car, f"{key} K", distortion), depth_camera

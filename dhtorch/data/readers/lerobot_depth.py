@@ -72,7 +72,8 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
         FormatError: an unknown unit, or a damaged image or video.
     """
     if feature.dtype == "video":
-        if _has_stated_range(feature) or _read_pixel_type(meta, feature, episode, row).bits <= CODE_BITS:
+        has_range = any(f"{prefix}{name}" in feature.info for name in DEFAULT_RANGE for prefix in ("", "video."))
+        if has_range or _read_pixel_type(meta, feature, episode, row).bits <= CODE_BITS:
             return None
         return DepthUnit(UNIT_METRES["mm"])
     entry = "unit" if feature.dtype != "image" and "depth_unit" not in feature.info else "depth_unit"
@@ -84,10 +85,6 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
         expected = f"one of {', '.join(UNIT_METRES)}"
         raise FormatError(meta.root / "meta" / "info.json", f"{feature.key} {entry}", stated, expected)
     return DepthUnit(UNIT_METRES[stated], f"meta/info.json: {feature.key} {entry}")
-
-
-def _has_stated_range(feature: LeRobotFeature) -> bool:
-    return any(f"{prefix}{name}" in feature.info for name in DEFAULT_RANGE for prefix in ("", "video."))
 
 
 def _stated_pixel_format(feature: LeRobotFeature) -> str | None:

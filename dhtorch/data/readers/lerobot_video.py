@@ -49,12 +49,11 @@ def pair_episode_videos(
             continue
         lost = numbers[nearest < 0].tolist()
         if lost:
-            report.append(_describe_lost(lost, file, bool((nearest[: len(times) - len(lost)] >= 0).all())))
+            at_end = bool((nearest[: len(times) - len(lost)] >= 0).all())
+            have = "have" if len(lost) > 1 else "has"
+            line = f"{format_numbers(lost, 'row')} {have} no picture in {file.name}: left out"
+            line += "; the video ends early, and its stamps do not show frames lost before" if at_end else ""
+            report.append(line)
         pictures[key] = nearest
         has_picture &= nearest >= 0
     return has_picture, {key: nearest[has_picture] for key, nearest in pictures.items()}, report
-
-
-def _describe_lost(lost: list[int], file: Path, at_end: bool) -> str:
-    line = f"{format_numbers(lost, 'row')} {'have' if len(lost) > 1 else 'has'} no picture in {file.name}: left out"
-    return f"{line}; the video ends early, and its stamps do not show frames lost before" if at_end else line

@@ -170,20 +170,23 @@ def parse_lens(
     Raises:
         FormatError: a camera model without OpenCV's distortion, or values that are no camera.
     """
-    _check_model(values, file, k)
-    lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
-    if k4 := _number(values, "k4", file, k, 0.0):
-        raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
-    hw = _parse_size(values, image, file, k)
-    return _parse_K(values, hw, file, k), hw, lens if any(lens) else None
-
-
-def _check_model(values: Mapping[str, Any], file: Path, k: int) -> None:
     model = values.get("camera_model", _PERSPECTIVE_MODELS[0])
     if model not in _PERSPECTIVE_MODELS or values.get("is_fisheye") is True:
         actual = "is_fisheye" if model in _PERSPECTIVE_MODELS else model
         expected = f"{', '.join(_PERSPECTIVE_MODELS)} (undistort other lenses first)"
         raise FormatError(file, f"frames.{k}.camera_model", actual, expected)
+    lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
+    if k4 := _number(values, "k4", file, k, 0.0):
+        raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
+    hw = _parse_size(values, image, file, k)
+    # K with pixel centres at integers, from focal lengths or Instant-NGP's angles
+    focal = {axis: _parse_focal(values, axis, size, file, k) for axis, size in (("x", hw[1]), ("y", hw[0]))}
+    fx = focal["x"] if focal["x"] is not None else focal["y"]
+    if fx is None:
+        raise FormatError(file, f"frames.{k}", "neither fl_x nor camera_angle_x", "the focal length of the images")
+    fy = fx if focal["y"] is None else focal["y"]
+    cx, cy = (_number(values, f"c{axis}", file, k, n / 2) for axis, n in (("x", hw[1]), ("y", hw[0])))
+    return convert.make_K(fx, fy, cx - 0.5, cy - 0.5), hw, lens if any(lens) else None
 
 
 def _parse_size(values: Mapping[str, Any], image: Path, file: Path, k: int) -> tuple[int, int]:
@@ -192,17 +195,6 @@ def _parse_size(values: Mapping[str, Any], image: Path, file: Path, k: int) -> t
         return files.read_image_header(image).hw
     h, w = (files.to_positive(values[name], file, f"frames.{k}.{name}") for name in "hw")
     return round(h), round(w)
-
-
-def _parse_K(values: Mapping[str, Any], hw: tuple[int, int], file: Path, k: int) -> np.ndarray:
-    """K with pixel centres at integers, from focal lengths or Instant-NGP's angles."""
-    focal = {axis: _parse_focal(values, axis, size, file, k) for axis, size in (("x", hw[1]), ("y", hw[0]))}
-    fx = focal["x"] if focal["x"] is not None else focal["y"]
-    if fx is None:
-        raise FormatError(file, f"frames.{k}", "neither fl_x nor camera_angle_x", "the focal length of the images")
-    fy = fx if focal["y"] is None else focal["y"]
-    cx, cy = (_number(values, f"c{axis}", file, k, n / 2) for axis, n in (("x", hw[1]), ("y", hw[0])))
-    return convert.make_K(fx, fy, cx - 0.5, cy - 0.5)
 
 
 def _parse_focal(values: Mapping[str, Any], axis: str, size: int, file: Path, k: int) -> float | None:
@@ -221,20 +213,16 @@ def _parse_pose(entry: Mapping[str, Any], undo: np.ndarray, file: Path, k: int) 
     """Camera to world with OpenCV axes, in the world of the capture; None = the entry has no pose."""
     if "transform_matrix" not in entry:
         return None
-    if _is_lost(entry["transform_matrix"]):
+    matrix = entry["transform_matrix"]
+    rows = matrix if isinstance(matrix, list) else [matrix]
+    cells = [cell for row in rows for cell in (row if isinstance(row, list) else [row])]
+    if any(cell is None or (isinstance(cell, float) and not math.isfinite(cell)) for cell in cells):
         return np.full((4, 4), np.nan)
     c2w = parse_matrix(entry["transform_matrix"], file, f"frames.{k}.transform_matrix")
     scale = np.linalg.norm(undo[:3, 0])
     c2w = undo @ c2w
     c2w[:3, :3] /= scale
     return convert.cv_from_gl(c2w[None])[0]
-
-
-def _is_lost(matrix: Any) -> bool:
-    """Whether a matrix is null or has entries that are null or not finite, as exports mark lost tracking."""
-    rows = matrix if isinstance(matrix, list) else [matrix]
-    cells = [cell for row in rows for cell in (row if isinstance(row, list) else [row])]
-    return any(cell is None or (isinstance(cell, float) and not math.isfinite(cell)) for cell in cells)
 
 
 def parse_matrix(value: Any, file: Path, field: str) -> np.ndarray:

@@ -328,25 +328,21 @@ def _find_sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], t
     first_error: FormatError | None = None
     for shot in shots:
         try:
-            return _read_sizes(shot, meta)
+            hw = files.decode_image_header(shot.image.read(), shot.image.path).hw
+            if shot.depth.path.suffix == ".exr":
+                return hw, codec_exr.decode_exr_header(shot.depth.read(), shot.depth.path).hw
+            if meta.depth_hw is not None:
+                return hw, meta.depth_hw
+            data = shot.depth.read()
+            count = lzfse.lzfse_unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
+            if count / 4 not in _DEPTH_SIZES:
+                expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
+                raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
+            h, w = _DEPTH_SIZES[count // 4]
+            return hw, ((h, w) if meta.hw[0] > meta.hw[1] else (w, h))
         except FormatError as error:
             first_error = first_error or error
     raise first_error or FormatError(meta.file, "frames", "none", "at least one")
-
-
-def _read_sizes(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
-    hw = files.decode_image_header(shot.image.read(), shot.image.path).hw
-    if shot.depth.path.suffix == ".exr":
-        return hw, codec_exr.decode_exr_header(shot.depth.read(), shot.depth.path).hw
-    if meta.depth_hw is not None:
-        return hw, meta.depth_hw
-    data = shot.depth.read()
-    count = lzfse.lzfse_unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
-    if count / 4 not in _DEPTH_SIZES:
-        expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
-        raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
-    h, w = _DEPTH_SIZES[count // 4]
-    return hw, ((h, w) if meta.hw[0] > meta.hw[1] else (w, h))
 
 
 def _is_damaged(shot: _Shot) -> bool:

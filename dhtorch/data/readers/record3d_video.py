@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,15 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
         problem = f"{near} to {far} m in an image {header.hw[1]} px wide"
         raise FormatError(source, "rangeOfEncodedDepth", problem, "two increasing depths, two halves")
     camera = convert.to_camera(K, hw, source, "intrinsicMatrix")
-    load = _Load(file, header.hw, camera, float(near), float(far), files.to_positive(max_step, file, "option max_step"))
+    load = partial(
+        _load_frame,
+        file=file,
+        hw=header.hw,
+        camera=camera,
+        near=float(near),
+        far=float(far),
+        max_step=files.to_positive(max_step, file, "option max_step"),
+    )
     number = torch.arange(header.n)
     times, remarks = _read_times(file, header)
     return [
@@ -74,24 +82,23 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    file: Path,
+    hw: tuple[int, int],  # of the whole image, both halves
+    camera: Camera,
+    near: float,  # m
+    far: float,
+    max_step: float,
+) -> Frame:
     """Position → frame."""
-
-    file: Path
-    hw: tuple[int, int]  # of the whole image, both halves
-    camera: Camera
-    near: float  # m
-    far: float
-    max_step: float
-
-    def __call__(self, i: int) -> Frame:
-        # Nearest: interpolating the half-size colour planes would blend hues.
-        picture = video.read_video_frame(self.file, i, self.hw, nearest=True)
-        half = self.hw[1] // 2
-        image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
-        depth = decode_hue_depth(picture[:, :half], self.near, self.far, self.max_step)
-        return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
+    # Nearest: interpolating the half-size colour planes would blend hues.
+    picture = video.read_video_frame(file, i, hw, nearest=True)
+    half = hw[1] // 2
+    image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
+    depth = decode_hue_depth(picture[:, :half], near, far, max_step)
+    return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], camera)
 
 
 def _read_times(file: Path, header: video.VideoHeader) -> tuple[torch.Tensor | None, list[str]]:

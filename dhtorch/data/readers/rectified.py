@@ -73,7 +73,19 @@ def read(root: str | Path) -> list[Recording]:
     root = Path(root)
     report: tuple[str, ...] = ()
     if (root / "calib.txt").is_file():
-        pair = _read_calib_pair(root)
+        file = root / "calib.txt"
+        entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
+        images = (root / "im0.png", root / "im1.png")
+        hw = files.read_image_header(images[0]).hw
+        size = (_parse_number(entries, "height", file), _parse_number(entries, "width", file))
+        if size != hw:
+            raise FormatError(file, "width and height", f"{size[1]:g}x{size[0]:g}", f"{hw[1]}x{hw[0]}, as im0.png")
+        first, second = (_find_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
+        if first is None:
+            raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
+        cameras = [convert.to_camera(_parse_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
+        baseline, doffs = _parse_number(entries, "baseline", file) / 1000, _parse_number(entries, "doffs", file)
+        pair = _check_pair(_LoadPair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
     elif (root / "dmin.txt").is_file():
         pair, report = _read_views_pair(root), (_VIEWS_ASSUMPTION,)
     else:
@@ -117,22 +129,6 @@ class _LoadPair:
             f = camera.f[0, 0].double().item()
             depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
         return Frame(image[None], torch.from_numpy(depth)[None], camera)
-
-
-def _read_calib_pair(root: Path) -> _LoadPair:
-    file = root / "calib.txt"
-    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
-    images = (root / "im0.png", root / "im1.png")
-    hw = files.read_image_header(images[0]).hw
-    size = (_parse_number(entries, "height", file), _parse_number(entries, "width", file))
-    if size != hw:
-        raise FormatError(file, "width and height", f"{size[1]:g}x{size[0]:g}", f"{hw[1]}x{hw[0]}, as im0.png")
-    first, second = (_find_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
-    if first is None:
-        raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
-    cameras = [convert.to_camera(_parse_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
-    baseline, doffs = _parse_number(entries, "baseline", file) / 1000, _parse_number(entries, "doffs", file)
-    return _check_pair(_LoadPair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
 
 
 def _read_npz_pair(root: Path) -> _LoadPair:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -84,34 +83,36 @@ def read(
     depths = image_table.list_numbered(root / layout.depths, layout.depth_pattern)
     trajectory = root / layout.trajectory
     poses, report = _read_trajectory(trajectory, sorted(images))
-    rows, left_out = image_table.pair_numbered(images, depths, poses)
-    if not rows:
-        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "the images' numbers")
-    hw = files.read_image_header(rows[0].image).hw
+    rows, left_out = image_table.pair_numbered(root, images, depths, poses)
+    units, source, stated = layout.units_per_metre, None, None
     file = next((f for f in (root / _PARAMETERS_FILE, root.parent / _PARAMETERS_FILE) if f.is_file()), None)
-    parameters = {} if file is None else _read_parameters(file)
-    stated, scaled = _parse_camera(parameters, hw, file)
-    camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_PARAMETERS_FILE)
-    units = layout.units_per_metre
-    source = None
-    if file is not None and "scale" in parameters:
-        units, source = files.to_positive(parameters["scale"], file, "scale"), f"{file.name}: scale"
-    loader = image_table.ImageTableLoader(
-        rows=tuple(rows),
-        hw=hw,
-        depth_hw=image_table.read_depth_hw(rows[0].depth),
-        camera=camera,
-        units_per_metre=units,
-    )
+    if file is not None:
+        document = files.read_json(file)
+        parameters = document.get("camera", document)
+        if not isinstance(parameters, dict):
+            raise FormatError(file, "camera", parameters, "an object with w, h, fx, fy, cx, cy and scale")
+        if "fx" in parameters:
+            names = [parameters.get(name) for name in ("fx", "fy", "cx", "cy")]
+            matrix, hw = convert.make_K(*files.to_array(names, (4,), file, "fx, fy, cx, cy")), None
+            if "w" in parameters and "h" in parameters:
+                w, h = files.to_array([parameters["w"], parameters["h"]], (2,), file, "w, h").astype(int).tolist()
+                hw = (h, w)
+            stated = (matrix, file, "fx, fy, cx, cy", hw)
+        if "scale" in parameters:
+            units, source = files.to_positive(parameters["scale"], file, "scale"), f"{file.name}: scale"
     return [
         image_table.open_image_table(
             root,
             "replica",
-            loader,
+            rows,
+            (intrinsics, K, fov),
+            stated=stated,
+            where=_PARAMETERS_FILE,
+            units_per_metre=units,
             unit=DepthUnit(1 / units, source),
             poses_file=trajectory,
             fps=fps,
-            report=[*report, *left_out, *scaled, *guess],
+            report=[*report, *left_out],
         )
     ]
 
@@ -139,24 +140,3 @@ def _read_trajectory(file: Path, numbers: Sequence[int]) -> tuple[dict[int, np.n
         raise FormatError(file, "lines", len(rows), f"{len(numbers)}, one for each image (the last is {numbers[-1]})")
     note = f"{file.name}: {len(rows)} poses for {len(numbers)} images: matched by the images' numbers"
     return {number: rows[number] for number in numbers}, [note]
-
-
-def _read_parameters(file: Path) -> dict[str, Any]:
-    document = files.read_json(file)
-    camera = document.get("camera", document)
-    if not isinstance(camera, dict):
-        raise FormatError(file, "camera", camera, "an object with w, h, fx, fy, cx, cy and scale")
-    return camera
-
-
-def _parse_camera(
-    parameters: dict[str, Any], hw: tuple[int, int], file: Path | None
-) -> tuple[tuple[np.ndarray, Path, str] | None, tuple[str, ...]]:
-    if file is None or "fx" not in parameters:
-        return None, ()
-    values = files.to_array([parameters.get(name) for name in ("fx", "fy", "cx", "cy")], (4,), file, "fx, fy, cx, cy")
-    matrix, scaled = convert.make_K(*values), tuple[str, ...]()
-    if "w" in parameters and "h" in parameters:
-        w, h = files.to_array([parameters["w"], parameters["h"]], (2,), file, "w, h").astype(int).tolist()
-        matrix, scaled = image_table.fit_K(matrix, (h, w), hw, file)
-    return (matrix, file, "fx, fy, cx, cy"), scaled

@@ -236,14 +236,11 @@ def _iter_stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndar
 
 
 def _parse_vector(value: Any, file: Path, field: str) -> np.ndarray:
-    flat = value if isinstance(value, np.ndarray) else np.array(value) if _parse_numbers(value) else None
+    is_list = isinstance(value, list | tuple) and all(isinstance(x, int | float) for x in value)
+    flat = np.array(value) if is_list else value if isinstance(value, np.ndarray) else None
     if flat is None or flat.dtype.kind not in "fiu" or flat.ndim != 1 or len(flat) > 64:
         raise FormatError(file, field, type(value).__name__, "a vector of numbers")
     return flat.astype(np.float64)
-
-
-def _parse_numbers(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(isinstance(x, int | float) for x in value)
 
 
 def _check_mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,22 +56,21 @@ def open_set(
     options = {"max_difference": max_difference, "max_gap": max_gap, "outlier": outlier}
     names = [f"{folder.name}/{serial}" for folder, serial in scenes]
     depth = None if depth_root is None else Path(depth_root)
-    return Recordings(names, _OpenScene(base, tuple(scenes), depth, options))
+    return Recordings(names, partial(_open_scene, root=base, scenes=tuple(scenes), depth_root=depth, options=options))
 
 
-@dataclass(frozen=True)
-class _OpenScene:
+def _open_scene(
+    i: int,
+    *,
+    root: Path,
+    scenes: tuple[tuple[Path, str], ...],  # folder of the scene, serial of the camera
+    depth_root: Path | None,
+    options: dict[str, Any],
+) -> Recording:
     """Position → recording."""
-
-    root: Path
-    scenes: tuple[tuple[Path, str], ...]  # folder of the scene, serial of the camera
-    depth_root: Path | None
-    options: dict[str, Any]
-
-    def __call__(self, i: int) -> Recording:
-        scene, serial = self.scenes[i]
-        depth = None if self.depth_root is None else str(self.depth_root / scene.relative_to(self.root))
-        return rh20t.read(scene, serials=[serial], depth_root=depth, **self.options)[0]
+    scene, serial = scenes[i]
+    depth = None if depth_root is None else str(depth_root / scene.relative_to(root))
+    return rh20t.read(scene, serials=[serial], depth_root=depth, **options)[0]
 
 
 def _list_scenes(root: Path, camera: str) -> Iterator[tuple[Path, str]]:

@@ -12,8 +12,9 @@ cameras give no depth (NO_BASELINE).
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Camera, Frame
 
 _MAX_EPISODE_STEPS = 100_000  # steps of an episode
 
@@ -90,33 +91,45 @@ def read(
     """
     root = Path(root)
     rate = None if rate_hz is None else files.to_positive(rate_hz, root, "option rate_hz")
-    features = _read_step_features(root)
-    keys = _select_colour(root, features, camera)
+    file = root / "features.json"
+    nodes = files.get_entry(
+        files.read_json(file), f"featuresDict.features.{_STEPS_FEATURE}.sequence.feature", dict, file
+    )
+    features: dict[str, StepFeature] = {}
+    _flatten(nodes, "", features, file, 0)
+
+    def find(key: str, option: str, chosen: str | None, *names: str) -> str | None:
+        if chosen is not None and chosen not in features:
+            raise FormatError(root, f"option {option}", chosen, f"one of {', '.join(features)}")
+        return chosen or next((name for name in names if name != key and name in features), None)
+
     rigs = []
-    for key in keys:
+    for key in _select_colour(root, features, camera):
         hw = _picture_size(root, features, key)
         stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-        rig = _CameraSpec(
+        depth_names = (re.sub(word, "depth", key) for word in ("image", "rgb"))
+        rig = partial(
+            _open_camera,
             root=root,
             features=features,
             image=key,
             hw=hw,
-            depth=_find_depth_feature(root, features, key, depth),
+            depth=find(key, "depth", depth, *depth_names),
             stated=stated,
             K_depth=K_depth,
             distortion=distortion,
-            intrinsics=_find_companion(root, features, key, stated.feature, "intrinsics"),
-            pose=_find_companion(root, features, key, pose, "pose", "T_world_from_cam"),
+            intrinsics=find(key, "intrinsics", stated.feature, f"{key}_intrinsics"),
+            pose=find(key, "pose", pose, f"{key}_T_world_from_cam"),
             rate_hz=rate,
         )
-        rigs.append(rig)
+        rigs.append((key, rig))
     episodes = _locate_episodes(root, split, episode)
-    names = [
-        f"{_read_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}"
-        for e in episodes
-        for rig in rigs
-    ]
-    return Recordings(names, _MakeRecording(tuple(names), tuple(episodes), tuple(rigs)))
+    about = root / "dataset_info.json"
+    stated_name = files.read_json(about).get("name") if about.is_file() else None
+    of_set = stated_name if isinstance(stated_name, str) and stated_name else root.resolve().parent.name
+    names = [f"{of_set}/{e.split}_{e.number:06d}/{key.rpartition('/')[2]}" for e in episodes for key, _ in rigs]
+    parts = tuple(rig for _, rig in rigs)
+    return Recordings(names, partial(_make_recording, names=tuple(names), episodes=tuple(episodes), rigs=parts))
 
 
 @dataclass(frozen=True)
@@ -127,20 +140,6 @@ class StepFeature:
     dtype: str
     shape: tuple[int, ...]  # of one step; -1 = not stated
     encoded: bool = False  # an array stored as one string of encoded bytes
-
-
-def _read_step_features(root: Path) -> dict[str, StepFeature]:
-    """``features.json`` → name → feature of the steps, such as ``observation/image_0``.
-
-    Raises:
-        FormatError: no such file, or no steps in it.
-    """
-    file = root / "features.json"
-    tree = files.read_json(file)
-    nodes = files.get_entry(tree, f"featuresDict.features.{_STEPS_FEATURE}.sequence.feature", dict, file)
-    features: dict[str, StepFeature] = {}
-    _flatten(nodes, "", features, file, 0)
-    return features
 
 
 def _flatten(node: Any, name: str, features: dict[str, StepFeature], file: Path, depth: int) -> None:
@@ -172,13 +171,6 @@ def _parse_shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]
     return dimensions
 
 
-def _read_set_name(root: Path) -> str:
-    """The name in ``dataset_info.json``, else the name of the folder above."""
-    file = root / "dataset_info.json"
-    name = files.read_json(file).get("name") if file.is_file() else None
-    return name if isinstance(name, str) and name else root.resolve().parent.name
-
-
 def _select_colour(root: Path, features: dict[str, StepFeature], camera: str | Sequence[str] | None) -> list[str]:
     colour_features = [
         name for name, f in features.items() if f.kind == "image" and f.dtype == "uint8" and f.shape[-1:] != (1,)
@@ -205,29 +197,6 @@ def _picture_size(root: Path, features: dict[str, StepFeature], key: str) -> tup
     if pictures is None or pictures.kind != "bytes" or not pictures.spans:
         raise FormatError(place.file, key, "no images", "encoded images")
     return files.decode_image_header(tfrecord.read_span(place.file, pictures.spans[0]), place.file).hw
-
-
-def _find_depth_feature(root: Path, features: dict[str, StepFeature], image: str, option: str | None) -> str | None:
-    if option is not None:
-        return _check_feature(root, features, option, "depth")
-    names = (re.sub(word, "depth", image) for word in ("image", "rgb"))
-    return next((name for name in names if name != image and name in features), None)
-
-
-def _find_companion(
-    root: Path, features: dict[str, StepFeature], image: str, feature: str | None, option: str, suffix: str = ""
-) -> str | None:
-    """The feature named by the option, else ``<camera>_<suffix or option>`` where there is one."""
-    name = f"{image}_{suffix or option}"
-    return (
-        _check_feature(root, features, feature, option) if feature is not None else name if name in features else None
-    )
-
-
-def _check_feature(root: Path, features: dict[str, StepFeature], name: str | None, option: str) -> str | None:
-    if name is not None and name not in features:
-        raise FormatError(root, f"option {option}", name, f"one of {', '.join(features)}")
-    return name
 
 
 @dataclass(frozen=True)
@@ -266,19 +235,18 @@ def _locate_episodes(root: Path, split: str | None, numbers: int | Sequence[int]
     return locations
 
 
-@dataclass(frozen=True, eq=False)
-class _MakeRecording:
+def _make_recording(
+    i: int,
+    *,
+    names: tuple[str, ...],
+    episodes: tuple[RecordLocation, ...],
+    rigs: tuple[Callable[..., Recording], ...],
+) -> Recording:
     """Position → recording: the cameras of the first episode, then those of the second, …"""
-
-    names: tuple[str, ...]
-    episodes: tuple[RecordLocation, ...]
-    rigs: tuple[_CameraSpec, ...]
-
-    def __call__(self, i: int) -> Recording:
-        episode, rig = self.episodes[i // len(self.rigs)], self.rigs[i % len(self.rigs)]
-        body = tfrecord.read_record(episode.file, episode.span)
-        example = tfrecord.parse_example(body, episode.file, episode.span.offset)
-        return rig.recording(self.names[i], episode, example)
+    episode, rig = episodes[i // len(rigs)], rigs[i % len(rigs)]
+    body = tfrecord.read_record(episode.file, episode.span)
+    example = tfrecord.parse_example(body, episode.file, episode.span.offset)
+    return rig(names[i], episode, example)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,125 +280,109 @@ class LoadStep:
         return torch.from_numpy(np.where(keep, depth, 0).astype(np.float32))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _CameraSpec:
-    """One camera of the set with its features and options."""
+Example = dict[str, tfrecord.ExampleFeature]
 
-    root: Path
-    features: dict[str, StepFeature]
-    image: str
-    hw: tuple[int, int]
-    depth: str | None
-    stated: intrinsics_options.ParsedIntrinsics
-    K_depth: Sequence[float] | None
-    distortion: Sequence[float] | None
-    intrinsics: str | None
-    pose: str | None
-    rate_hz: float | None
 
-    def recording(self, name: str, episode: RecordLocation, example: dict[str, tfrecord.ExampleFeature]) -> Recording:
-        """The recording of this camera in an episode, from the episode's parsed record."""
-        file = episode.file
-        images = self._pictures(file, example, self.image)
-        n = len(images)
-        if not 0 < n <= _MAX_EPISODE_STEPS:
-            raise FormatError(file, self.image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
-        depths = () if self.depth is None else self._depths(file, example, self.depth, n)
-        cameras, depth_camera = self._cameras(file, example, n)
-        load = LoadStep(
-            file=file,
-            images=images,
-            hw=self.hw,
-            depths=depths,
-            depth=None if self.depth is None else self.features[self.depth],
-            cameras=cameras,
-            depth_camera=depth_camera,
-            place=episode,
-            features=self.features,
+def _open_camera(
+    name: str,
+    episode: RecordLocation,
+    example: Example,
+    *,
+    root: Path,
+    features: dict[str, StepFeature],
+    image: str,
+    hw: tuple[int, int],
+    depth: str | None,
+    stated: intrinsics_options.ParsedIntrinsics,
+    K_depth: Sequence[float] | None,
+    distortion: Sequence[float] | None,
+    intrinsics: str | None,
+    pose: str | None,
+    rate_hz: float | None,
+) -> Recording:
+    """The recording of a camera with its features and options in an episode, from the episode's parsed record."""
+    file, described = episode.file, features[depth] if depth else None
+    images = _pictures(file, example, image)
+    n = len(images)
+    if not 0 < n <= _MAX_EPISODE_STEPS:
+        raise FormatError(file, image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
+    depths = _depths(root, file, example, depth, described, (n, image)) if depth and described else ()
+    h, w = (*(described.shape if described else ()), -1, -1)[:2]
+    depth_hw, depth_camera = (h, w) if min(h, w) > 0 else None, None
+    if described is not None and K_depth is not None:
+        matrix = convert.parse_K_option(K_depth, root, "option K_depth")
+        depth_camera = convert.to_camera(matrix, depth_hw or hw, root, "K_depth")
+    if stated.K is not None:
+        cameras = convert.to_camera(convert.make_K(*stated.K), hw, root, "option K", distortion)
+    elif intrinsics is None:
+        raise intrinsics_options.missing_intrinsics_error(
+            root, image, "data.intrinsics=FEATURE", depth=depth is not None
         )
-        return Recording(
-            name=name,
-            format="rlds",
-            load=load,
-            number=consecutive_frame_numbers(n),
-            root=self.root,
-            times=None if self.rate_hz is None else consecutive_frame_numbers(n).double() / self.rate_hz,
-            poses=None if self.pose is None else self._poses(file, example, self.pose, n),
-            rate_hz=self.rate_hz,
-            report=self.stated.report + (() if self.depth else (f"{self.image}: no depth feature: depth is empty",)),
-            episode=episode.place,
-            camera_name=self.image,
-            depth_unit=_ASSUMED_DEPTH_UNITS.get(self.features[self.depth].kind) if self.depth else None,
-            stored=StoredSizes(self.hw, self._registered_depth_hw()),
-        )
+    else:
+        values = _numbers(file, example, intrinsics, features[intrinsics], (4, 9), n)
+        cameras = convert.to_cameras(values, hw, file, intrinsics, distortion)
+    poses = None
+    if pose is not None:
+        poses = convert.parse_poses(_numbers(file, example, pose, features[pose], (7, 16), n), file, pose)
+    number = consecutive_frame_numbers(n)
+    return Recording(
+        name=name,
+        format="rlds",
+        load=LoadStep(file, images, hw, depths, described, cameras, depth_camera, episode, features),
+        number=number,
+        root=root,
+        times=None if rate_hz is None else number.double() / rate_hz,
+        poses=poses,
+        rate_hz=rate_hz,
+        report=stated.report + (() if depth else (f"{image}: no depth feature: depth is empty",)),
+        episode=episode.place,
+        camera_name=image,
+        depth_unit=_ASSUMED_DEPTH_UNITS.get(described.kind) if described else None,
+        # Depth with a K of its own does not cover the image's field.
+        stored=StoredSizes(hw, None if K_depth is not None else depth_hw),
+    )
 
-    def _registered_depth_hw(self) -> tuple[int, int] | None:
-        """Size of depth over the picture's field, if the features state it; None for depth with its own K."""
-        h, w = (*(self.features[self.depth].shape if self.depth else ()), -1, -1)[:2]
-        return None if self.K_depth is not None or min(h, w) < 1 else (h, w)
 
-    def _pictures(
-        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str
-    ) -> tuple[tfrecord.ByteSpan, ...]:
-        feature = example.get(f"{_STEPS_FEATURE}/{key}")
-        if feature is None or feature.kind != "bytes":
-            raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded images")
-        return feature.spans
+def _pictures(file: Path, example: Example, key: str) -> tuple[tfrecord.ByteSpan, ...]:
+    feature = example.get(f"{_STEPS_FEATURE}/{key}")
+    if feature is None or feature.kind != "bytes":
+        raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded images")
+    return feature.spans
 
-    def _depths(
-        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, n: int
-    ) -> tuple[tfrecord.ByteSpan, ...]:
-        """Span of bytes of each step's depth (n)."""
-        described = self.features[key]
-        if described.kind == "image":
-            spans = self._pictures(file, example, key)
-            if len(spans) != n:
-                raise FormatError(file, key, f"{len(spans)} images", f"{n}, as many as {self.image}")
-            return spans
-        shape, feature = described.shape, example.get(f"{_STEPS_FEATURE}/{key}")
-        h, w = (*shape, 0, 0)[:2]
-        single = len(shape) == 2 or (len(shape) == 3 and shape[2] == 1)
-        if described.dtype != "float32" or described.encoded or not single or min(h, w) < 1:
-            stored = f"{described.dtype} {shape}"
-            raise FormatError(self.root / "features.json", key, stored, "16-bit images, or float32 (h, w)")
-        size = 4 * h * w
-        whole = feature is not None and feature.kind == "float" and len(feature.spans) == 1
-        if feature is None or not whole or feature.spans[0].length != n * size:
-            raise FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
-        return tuple(tfrecord.ByteSpan(feature.spans[0].offset + i * size, size) for i in range(n))
 
-    def _numbers(
-        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, sizes: tuple[int, ...], n: int
-    ):
-        """Values (n, size) float64 of a feature, one row a step; ``size`` must be one of ``sizes``."""
-        described = self.features[key]
-        size = int(np.prod(described.shape)) if described.shape and min(described.shape) > 0 else 0
-        feature = example.get(f"{_STEPS_FEATURE}/{key}")
-        if feature is None or size not in sizes:
-            expected = " or ".join(map(str, sizes))
-            raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
-        values = tfrecord.read_feature_numbers(file, key, feature, n * size)
-        if len(values) != n * size:
-            raise FormatError(file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
-        return values.reshape(n, size).astype(np.float64)
+def _depths(
+    root: Path, file: Path, example: Example, key: str, described: StepFeature, steps: tuple[int, str]
+) -> tuple[tfrecord.ByteSpan, ...]:
+    """Span of bytes of the depth of each step, as many as of the image."""
+    n, image = steps
+    if described.kind == "image":
+        spans = _pictures(file, example, key)
+        if len(spans) != n:
+            raise FormatError(file, key, f"{len(spans)} images", f"{n}, as many as {image}")
+        return spans
+    shape, feature = described.shape, example.get(f"{_STEPS_FEATURE}/{key}")
+    h, w = (*shape, 0, 0)[:2]
+    single = len(shape) == 2 or (len(shape) == 3 and shape[2] == 1)
+    if described.dtype != "float32" or described.encoded or not single or min(h, w) < 1:
+        stored = f"{described.dtype} {shape}"
+        raise FormatError(root / "features.json", key, stored, "16-bit images, or float32 (h, w)")
+    size = 4 * h * w
+    whole = feature is not None and feature.kind == "float" and len(feature.spans) == 1
+    if feature is None or not whole or feature.spans[0].length != n * size:
+        raise FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
+    return tuple(tfrecord.ByteSpan(feature.spans[0].offset + i * size, size) for i in range(n))
 
-    def _cameras(self, file: Path, example: dict[str, tfrecord.ExampleFeature], n: int) -> tuple[Camera, Camera | None]:
-        of_depth = None
-        if self.depth is not None and self.K_depth is not None:
-            shape = self.features[self.depth].shape
-            hw = (shape[0], shape[1]) if len(shape) >= 2 and min(shape[:2]) > 0 else self.hw
-            of_depth = convert.to_camera(
-                convert.parse_K_option(self.K_depth, self.root, "option K_depth"), hw, self.root, "K_depth"
-            )
-        if self.stated.K is not None:
-            K = convert.make_K(*self.stated.K)
-            return convert.to_camera(K, self.hw, self.root, "option K", self.distortion), of_depth
-        if self.intrinsics is None:
-            raise intrinsics_options.missing_intrinsics_error(
-                self.root, self.image, "data.intrinsics=FEATURE", depth=self.depth is not None
-            )
-        values = self._numbers(file, example, self.intrinsics, (4, 9), n)
-        return convert.to_cameras(values, self.hw, file, self.intrinsics, self.distortion), of_depth
 
-    def _poses(self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, n: int) -> Pose:
-        return convert.parse_poses(self._numbers(file, example, key, (7, 16), n), file, key)
+def _numbers(
+    file: Path, example: Example, key: str, described: StepFeature, sizes: tuple[int, ...], n: int
+) -> np.ndarray:
+    """Values (n, size) float64 of a feature, one row a step; ``size`` must be one of ``sizes``."""
+    size = int(np.prod(described.shape)) if described.shape and min(described.shape) > 0 else 0
+    feature = example.get(f"{_STEPS_FEATURE}/{key}")
+    if feature is None or size not in sizes:
+        expected = " or ".join(map(str, sizes))
+        raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
+    values = tfrecord.read_feature_numbers(file, key, feature, n * size)
+    if len(values) != n * size:
+        raise FormatError(file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
+    return values.reshape(n, size).astype(np.float64)

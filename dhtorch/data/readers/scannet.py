@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
@@ -99,41 +98,37 @@ def read(
     images = image_table.list_numbered(root / layout.colour, layout.colour_pattern)
     depths = image_table.list_numbered(root / layout.depth, layout.depth_pattern)
     poses = {number: image_table.read_pose(file) for number, file in _list_poses(root, layout).items()}
-    rows, report = image_table.pair_numbered(images, depths, poses)
-    if not rows:
-        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "the images' numbers")
+    rows, report = image_table.pair_numbered(root, images, depths, poses)
     hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
     colour_file, depth_file = _find_intrinsics(root, _COLOUR_FILES), _find_intrinsics(root, _DEPTH_FILES)
-    stated = None
-    if colour_file is not None:
-        matrix, scaled = _fit_colour_K(image_table.read_K(colour_file), hw, colour_file)
-        stated, report = (matrix, colour_file, "K"), [*report, *scaled]
-    elif depth_file is not None and hw == depth_hw:
-        stated = (image_table.read_K(depth_file), depth_file, "K")
-    camera, guess = image_table.choose_camera(
-        root, hw, stated, intrinsics, K, fov, where="intrinsic/intrinsic_color.txt"
-    )
-    depth_camera = None
+    stated = depth_stated = None
     if depth_file is not None:
-        depth_camera = convert.to_camera(image_table.read_K(depth_file), depth_hw, depth_file)
-    report += _report_extrinsics(root)
-    loader = image_table.ImageTableLoader(
-        rows=tuple(rows),
-        hw=hw,
-        depth_hw=depth_hw,
-        camera=camera,
-        depth_camera=depth_camera,
-        units_per_metre=_UNITS_PER_METRE,
-    )
+        depth_stated = (image_table.read_K(depth_file), depth_file, "K", None)
+    if colour_file is not None:
+        matrix = image_table.read_K(colour_file)
+        # Many exports have smaller images beside the K of the original size.
+        is_fitting = abs(matrix[0, 2] - (hw[1] - 1) / 2) <= intrinsics_options.MAX_CENTRE_OFFSET * hw[1]
+        stated = (matrix, colour_file, "K", None if is_fitting else _COLOUR_HW)
+    elif hw == depth_hw:
+        stated = depth_stated
+    for name in _EXTRINSICS_FILES:
+        file = _find_intrinsics(root, (name,))
+        if file is not None and not np.allclose(image_table.read_pose(file), np.eye(4), atol=1e-6):
+            report.append(f"{name} is not the identity; not applied: ScanNet's depth is already aligned to colour")
     return [
         image_table.open_image_table(
             root,
             "scannet",
-            loader,
+            rows,
+            (intrinsics, K, fov),
+            stated=stated,
+            where="intrinsic/intrinsic_color.txt",
+            depth_stated=depth_stated,
+            units_per_metre=_UNITS_PER_METRE,
             unit=DepthUnit(1 / _UNITS_PER_METRE, "ScanNet stores mm"),
             poses_file=root / layout.pose,
             fps=fps,
-            report=[*report, *guess],
+            report=report,
         )
     ]
 
@@ -157,19 +152,3 @@ def _list_poses(root: Path, layout: _Layout) -> dict[int, Path]:
 def _find_intrinsics(root: Path, names: Sequence[str]) -> Path | None:
     places = (root / folder / name for folder in _INTRINSICS_FOLDERS for name in names)
     return next((place for place in places if place.is_file()), None)
-
-
-def _fit_colour_K(K: np.ndarray, hw: tuple[int, int], file: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """K of the images' size: many exports have smaller images beside the K of the original size."""
-    if abs(K[0, 2] - (hw[1] - 1) / 2) <= intrinsics_options.MAX_CENTRE_OFFSET * hw[1]:
-        return K, ()
-    return image_table.fit_K(K, _COLOUR_HW, hw, file)
-
-
-def _report_extrinsics(root: Path) -> list[str]:
-    report = []
-    for name in _EXTRINSICS_FILES:
-        file = _find_intrinsics(root, (name,))
-        if file is not None and not np.allclose(image_table.read_pose(file), np.eye(4), atol=1e-6):
-            report.append(f"{name} is not the identity; not applied: ScanNet's depth is already aligned to colour")
-    return report

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
@@ -22,8 +21,6 @@ from dhtorch.data.units import DepthUnit
 
 _INFO_FILES = ("_info.txt", "info.txt")
 _FRAME_FOLDERS = (".", "sequence", "frames")
-_DEPTH_PATTERN = r"frame-(\d+)\.depth\.(?:pgm|png)"
-_POSE_PATTERN = r"frame-(\d+)\.pose\.txt"
 _SHIFT_FIELD = "m_depthShift"
 
 #: Labels of the data sets' meshes.
@@ -66,41 +63,37 @@ def read(
     if place is None:
         raise FormatError(root, "files", "none", "_info.txt and frame-XXXXXX.color.jpg")
     info, folder = place
-    fields = _read_fields(info)
-    images = image_table.list_numbered(folder, image_table.NAMED_COLOUR_PATTERN)
-    depths = image_table.list_numbered(folder, _DEPTH_PATTERN)
-    poses = {
-        number: image_table.read_pose(file) for number, file in image_table.list_numbered(folder, _POSE_PATTERN).items()
-    }
-    rows, report = image_table.pair_numbered(images, depths, poses)
-    if not rows:
-        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "the images' numbers")
-    hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
-    colour_K, colour_scaled = _parse_K(fields, "Color", hw, info)
-    depth_K, depth_scaled = _parse_K(fields, "Depth", depth_hw, info)
-    stated = None if colour_K is None else (colour_K, info, "m_calibrationColorIntrinsic")
-    camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=info.name)
-    depth_camera = None
-    if depth_K is not None:
-        depth_camera = convert.to_camera(depth_K, depth_hw, info, "m_calibrationDepthIntrinsic")
+    parts = [line.partition("=") for line in files.read_lines(info)]
+    fields = {name.strip(): value.strip() for name, mark, value in parts if mark}
+    pose_files = image_table.list_numbered(folder, r"frame-(\d+)\.pose\.txt")
+    rows, report = image_table.pair_numbered(
+        root,
+        image_table.list_numbered(folder, image_table.NAMED_COLOUR_PATTERN),
+        image_table.list_numbered(folder, r"frame-(\d+)\.depth\.(?:pgm|png)"),
+        {number: image_table.read_pose(file) for number, file in pose_files.items()},
+    )
     units, source = 1000.0, None
     if _SHIFT_FIELD in fields:
-        units = files.to_positive(_parse_number(fields[_SHIFT_FIELD], info), info, _SHIFT_FIELD)
-        source = f"{info.name}: {_SHIFT_FIELD}"
-    report += [*_report_extrinsics(fields, info), *colour_scaled, *depth_scaled, *guess]
-    loader = image_table.ImageTableLoader(
-        rows=tuple(rows),
-        hw=hw,
-        depth_hw=depth_hw,
-        camera=camera,
-        depth_camera=depth_camera,
-        units_per_metre=units,
-    )
+        try:
+            units = float(fields[_SHIFT_FIELD])
+        except ValueError:
+            raise FormatError(info, _SHIFT_FIELD, fields[_SHIFT_FIELD], "a number") from None
+        units, source = files.to_positive(units, info, _SHIFT_FIELD), f"{info.name}: {_SHIFT_FIELD}"
+    names = [f"m_calibration{kind}Extrinsic" for kind in ("Color", "Depth")]
+    matrices = {name: _parse_matrix(fields[name], info, name) for name in names if name in fields}
+    apart = [name for name, matrix in matrices.items() if not np.allclose(matrix, np.eye(4), atol=1e-6)]
+    if apart:
+        report.append(f"{info.name}: {', '.join(apart)} not the identity; not applied: one centre is assumed")
     return [
         image_table.open_image_table(
             root,
             "sens_folder",
-            loader,
+            rows,
+            (intrinsics, K, fov),
+            stated=_parse_K(fields, "Color", info),
+            where=info.name,
+            depth_stated=_parse_K(fields, "Depth", info),
+            units_per_metre=units,
             unit=DepthUnit(1 / units, source),
             poses_file=folder,
             fps=fps,
@@ -121,19 +114,6 @@ def _find_scan(root: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _read_fields(info: Path) -> dict[str, str]:
-    """Values of the lines ``name = value``, as text."""
-    parts = [line.partition("=") for line in files.read_lines(info)]
-    return {name.strip(): value.strip() for name, mark, value in parts if mark}
-
-
-def _parse_number(text: str, info: Path) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise FormatError(info, _SHIFT_FIELD, text, "a number") from None
-
-
 def _parse_matrix(text: str, info: Path, field: str) -> np.ndarray:
     try:
         values = [float(word) for word in text.split()]
@@ -142,22 +122,11 @@ def _parse_matrix(text: str, info: Path, field: str) -> np.ndarray:
     return files.to_array(values, (16,), info, field).reshape(4, 4)
 
 
-def _parse_K(
-    fields: dict[str, str], kind: str, hw: tuple[int, int], info: Path
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """K (3, 3) of ``kind`` Color or Depth for images of size ``hw``, None where there is none; report of scaling."""
+def _parse_K(fields: dict[str, str], kind: str, info: Path) -> image_table.StatedK | None:
+    """K of ``kind`` Color or Depth with the size it is stated for; None where there is none."""
     field = f"m_calibration{kind}Intrinsic"
     if field not in fields:
-        return None, ()
-    matrix = _parse_matrix(fields[field], info, field)[:3, :3]
+        return None
     size = [fields.get(f"m_{kind.lower()}{side}", "") for side in ("Height", "Width")]
-    if not all(text.isdigit() for text in size):
-        return matrix, ()
-    return image_table.fit_K(matrix, (int(size[0]), int(size[1])), hw, info)
-
-
-def _report_extrinsics(fields: dict[str, str], info: Path) -> list[str]:
-    names = [f"m_calibration{kind}Extrinsic" for kind in ("Color", "Depth")]
-    applied = [name for name in names if name in fields]
-    apart = [name for name in applied if not np.allclose(_parse_matrix(fields[name], info, name), np.eye(4), atol=1e-6)]
-    return [f"{info.name}: {', '.join(apart)} not the identity; not applied: one centre is assumed"] if apart else []
+    hw = (int(size[0]), int(size[1])) if all(text.isdigit() for text in size) else None
+    return _parse_matrix(fields[field], info, field)[:3, :3], info, field, hw

@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -93,7 +93,17 @@ def read(
         raise FormatError(root, "option clip_planes", planes.tolist(), "0 < near < far")
     entries = [(episode, name) for episode in episodes for name in chosen]
     names = [f"{root.stem}/{episode.rpartition('/')[2]}/{name}" for episode, name in entries]
-    return Recordings(names, _MakeRecording(root, tuple(entries), tuple(names), (intrinsics, K, fov), planes))
+    return Recordings(
+        names,
+        partial(
+            _make_recording,
+            file=root,
+            entries=tuple(entries),
+            names=tuple(names),
+            K_options=(intrinsics, K, fov),
+            planes=planes,
+        ),
+    )
 
 
 class _Arrays(NamedTuple):
@@ -109,78 +119,83 @@ class _Arrays(NamedTuple):
     layout: str
 
 
-@dataclass(frozen=True, eq=False)
-class _MakeRecording:
+def _make_recording(
+    i: int,
+    *,
+    file: Path,
+    entries: tuple[tuple[str, str], ...],  # (path of the episode, camera)
+    names: tuple[str, ...],
+    K_options: tuple[intrinsics_options.IntrinsicsOption | None, Sequence[float] | None, float | None],
+    planes: np.ndarray | None,
+) -> Recording:
     """Position → recording."""
+    episode, name = entries[i]
+    arrays = next((entry for entry in _list_cameras(file, episode) if entry.name == name), None)
+    if arrays is None:
+        raise FormatError(file, episode, f"no depth of {name}", "that of the first episode's cameras")
+    n, hw = _check_shapes(arrays)
+    info = _read_camera_info(file, episode, name)
+    option = intrinsics_options.parse_intrinsics(file, hw, *K_options)
+    if option.feature is not None:
+        raise FormatError(file, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
+    if option.K is not None:
+        camera = convert.to_camera(convert.make_K(*option.K), hw, file, "option K")
+    elif arrays.K is not None:
+        camera = _read_cameras(arrays.K, n, hw)
+    elif "intrinsics" in info:
+        camera = convert.to_camera(_to_pixel_centres(info["intrinsics"]), hw, file, "camera_info intrinsics")
+    else:
+        raise intrinsics_options.missing_intrinsics_error(file, name)
+    is_whole = arrays.depth.dtype.kind in "iu"
+    load = partial(
+        _load_frame,
+        arrays=arrays,
+        hw=hw,
+        camera=camera,
+        metres=1 / arrays.codes_per_metre if is_whole else 1.0,
+        planes=planes,
+    )
+    number = int(episode.rpartition("_")[2][:_MAX_DIGITS])
+    return Recording(
+        name=names[i],
+        format="simulator_hdf5",
+        load=load,
+        number=consecutive_frame_numbers(n),
+        root=file,
+        poses=_read_poses(arrays, n, info),
+        episode=number,
+        camera_name=name,
+        report=option.report,
+        depth_unit=DepthUnit(1 / arrays.codes_per_metre, f"{arrays.layout}: definition of its depth")
+        if is_whole
+        else None,
+    )
 
-    file: Path
-    entries: tuple[tuple[str, str], ...]  # (path of the episode, camera)
-    names: tuple[str, ...]
-    K_options: tuple[intrinsics_options.IntrinsicsOption | None, Sequence[float] | None, float | None]
-    planes: np.ndarray | None
 
-    def __call__(self, i: int) -> Recording:
-        episode, name = self.entries[i]
-        arrays = next((entry for entry in _list_cameras(self.file, episode) if entry.name == name), None)
-        if arrays is None:
-            raise FormatError(self.file, episode, f"no depth of {name}", "that of the first episode's cameras")
-        n, hw = _check_shapes(arrays)
-        info = _read_camera_info(self.file, episode, name)
-        option = intrinsics_options.parse_intrinsics(self.file, hw, *self.K_options)
-        if option.feature is not None:
-            raise FormatError(self.file, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
-        if option.K is not None:
-            camera = convert.to_camera(convert.make_K(*option.K), hw, self.file, "option K")
-        elif arrays.K is not None:
-            camera = _read_cameras(arrays.K, n, hw)
-        elif "intrinsics" in info:
-            camera = convert.to_camera(_to_pixel_centres(info["intrinsics"]), hw, self.file, "camera_info intrinsics")
-        else:
-            raise intrinsics_options.missing_intrinsics_error(self.file, name)
-        is_whole = arrays.depth.dtype.kind in "iu"
-        load = _Load(arrays, hw, camera, 1 / arrays.codes_per_metre if is_whole else 1.0, self.planes)
-        number = int(episode.rpartition("_")[2][:_MAX_DIGITS])
-        return Recording(
-            name=self.names[i],
-            format="simulator_hdf5",
-            load=load,
-            number=consecutive_frame_numbers(n),
-            root=self.file,
-            poses=_read_poses(arrays, n, info),
-            episode=number,
-            camera_name=name,
-            report=option.report,
-            depth_unit=DepthUnit(1 / arrays.codes_per_metre, f"{arrays.layout}: definition of its depth")
-            if is_whole
-            else None,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    arrays: _Arrays,
+    hw: tuple[int, int],
+    camera: Camera,  # one, or one for each step
+    metres: float,
+    planes: np.ndarray | None,
+) -> Frame:
     """Position → frame."""
-
-    arrays: _Arrays
-    hw: tuple[int, int]
-    camera: Camera  # one, or one for each step
-    metres: float
-    planes: np.ndarray | None
-
-    def __call__(self, i: int) -> Frame:
-        image = self.arrays.image.row(i)
-        depth = self.arrays.depth.row(i).reshape(self.arrays.depth.shape[1:3])
-        if self.planes is not None:
-            near, far = self.planes
-            with np.errstate(divide="ignore", invalid="ignore"):
-                metric = np.where(depth < 1, near / (1 - depth.astype(np.float64) * (1 - near / far)), 0.0)
-        else:
-            metric = files.to_metres(depth, 1 / self.metres) if depth.dtype.kind in "iu" else depth
-        metric = metric.astype(np.float32)
-        with np.errstate(invalid="ignore"):
-            metric = np.where(np.isfinite(metric) & (metric > 0), metric, np.float32(0))
-        camera = self.camera if self.camera.f.shape[0] == 1 else self.camera[i : i + 1]
-        picture = torch.from_numpy(np.ascontiguousarray(_to_bytes(image)[..., :3].transpose(2, 0, 1)))
-        return Frame(picture[None], torch.from_numpy(metric)[None], camera)
+    image = arrays.image.row(i)
+    depth = arrays.depth.row(i).reshape(arrays.depth.shape[1:3])
+    if planes is not None:
+        near, far = planes
+        with np.errstate(divide="ignore", invalid="ignore"):
+            metric = np.where(depth < 1, near / (1 - depth.astype(np.float64) * (1 - near / far)), 0.0)
+    else:
+        metric = files.to_metres(depth, 1 / metres) if depth.dtype.kind in "iu" else depth
+    metric = metric.astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        metric = np.where(np.isfinite(metric) & (metric > 0), metric, np.float32(0))
+    camera = camera if camera.f.shape[0] == 1 else camera[i : i + 1]
+    picture = torch.from_numpy(np.ascontiguousarray(_to_bytes(image)[..., :3].transpose(2, 0, 1)))
+    return Frame(picture[None], torch.from_numpy(metric)[None], camera)
 
 
 def _to_bytes(image: np.ndarray) -> np.ndarray:
@@ -214,35 +229,23 @@ def _list_cameras(file: Path, episode: str) -> list[_Arrays]:
         ("image", "camera_param", _MANISKILL_2_CODES_PER_METRE, "ManiSkill 2"),
     ):
         if obs.get(data, 0) is None:
-            return _list_maniskill_cameras(
-                file, f"{episode}/obs", data, parameters, codes_per_metre=codes, layout=layout
-            )
+            path, cameras = f"{episode}/obs", []
+            stated = list_hdf5_group(file, f"{path}/{parameters}") if obs.get(parameters, 0) is None else {}
+            for name, group in list_hdf5_group(file, f"{path}/{data}").items():
+                arrays = {} if group is not None else list_hdf5_group(file, f"{path}/{data}/{name}")
+                image, depth = arrays.get("rgb") or arrays.get("Color"), arrays.get("depth")
+                if image is None or depth is None:
+                    continue
+                values = list_hdf5_group(file, f"{path}/{parameters}/{name}") if name in stated else {}
+                intrinsic, extrinsic, model = (values.get(k) for k in ("intrinsic_cv", "extrinsic_cv", "cam2world_gl"))
+                cameras.append(_Arrays(name, image, depth, intrinsic, extrinsic, model, codes, layout))
+            return cameras
     cameras = []
     for key, depth in obs.items():
         name = key.removesuffix("_depth")
         image = obs.get(f"{name}_image")
         if key.endswith("_depth") and depth is not None and image is not None:
             cameras.append(_Arrays(name, image, depth, None, None, None, _CODES_PER_METRE, "robomimic"))
-    return cameras
-
-
-def _list_maniskill_cameras(
-    file: Path, obs: str, data: str, parameters: str, *, codes_per_metre: float, layout: str
-) -> list[_Arrays]:
-    cameras = []
-    stated = (
-        list_hdf5_group(file, f"{obs}/{parameters}") if list_hdf5_group(file, obs).get(parameters, 0) is None else {}
-    )
-    for name, group in list_hdf5_group(file, f"{obs}/{data}").items():
-        if group is not None:
-            continue
-        arrays = list_hdf5_group(file, f"{obs}/{data}/{name}")
-        image, depth = arrays.get("rgb") or arrays.get("Color"), arrays.get("depth")
-        if image is None or depth is None:
-            continue
-        values = list_hdf5_group(file, f"{obs}/{parameters}/{name}") if name in stated else {}
-        intrinsic, extrinsic, model = (values.get(k) for k in ("intrinsic_cv", "extrinsic_cv", "cam2world_gl"))
-        cameras.append(_Arrays(name, image, depth, intrinsic, extrinsic, model, codes_per_metre, layout))
     return cameras
 
 

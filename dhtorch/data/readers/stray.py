@@ -238,29 +238,28 @@ def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
     for place, line in enumerate(body):
         if len(line) != len(head):
             raise FormatError(file, f"row {place}", f"{len(line)} columns", f"{len(head)}, as the header")
-        row = _parse_row(place, dict(zip(head, line, strict=True)), file)
+        cells = dict(zip(head, line, strict=True))
+        number = cells["frame"]
+        if not (number.isascii() and number.isdigit() and len(number) <= 9):
+            raise FormatError(file, f"row {place} frame", number, "a frame number")
+        value = {
+            name: _parse_number(cells[name], file, f"row {place} {name}")
+            for name in _ODOMETRY_COLUMNS[:1] + _ODOMETRY_COLUMNS[2:]
+        }
+        if not np.isfinite(value["timestamp"]):
+            raise FormatError(file, f"row {place} timestamp", cells["timestamp"], "a time in s")
+        t, q = (
+            np.array([[value[name] for name in names]]) for names in (_ODOMETRY_COLUMNS[2:5], _ODOMETRY_COLUMNS[5:9])
+        )
+        with np.errstate(over="ignore"):
+            usable = np.isfinite(t).all() and 1e-6 < np.linalg.norm(q) < np.inf
+        c2w = convert.to_c2w(q, t, file)[0] if usable else np.full((4, 4), np.nan)
+        own = [_parse_number(cells.get(name, ""), file, f"row {place} {name}") for name in _INTRINSICS_COLUMNS]
+        row = _Row(place, int(number), value["timestamp"], c2w, np.array(own) if np.isfinite(own).all() else None)
         if rows and row.number <= rows[-1].number:
             raise FormatError(file, f"row {place} frame", row.number, f"a number beyond {rows[-1].number}")
         rows.append(row)
     return rows, report
-
-
-def _parse_row(place: int, cells: dict[str, str], file: Path) -> _Row:
-    number = cells["frame"]
-    if not (number.isascii() and number.isdigit() and len(number) <= 9):
-        raise FormatError(file, f"row {place} frame", number, "a frame number")
-    value = {
-        name: _parse_number(cells[name], file, f"row {place} {name}")
-        for name in _ODOMETRY_COLUMNS[:1] + _ODOMETRY_COLUMNS[2:]
-    }
-    if not np.isfinite(value["timestamp"]):
-        raise FormatError(file, f"row {place} timestamp", cells["timestamp"], "a time in s")
-    t, q = (np.array([[value[name] for name in names]]) for names in (_ODOMETRY_COLUMNS[2:5], _ODOMETRY_COLUMNS[5:9]))
-    with np.errstate(over="ignore"):
-        usable = np.isfinite(t).all() and 1e-6 < np.linalg.norm(q) < np.inf
-    c2w = convert.to_c2w(q, t, file)[0] if usable else np.full((4, 4), np.nan)
-    own = [_parse_number(cells.get(name, ""), file, f"row {place} {name}") for name in _INTRINSICS_COLUMNS]
-    return _Row(place, int(number), value["timestamp"], c2w, np.array(own) if np.isfinite(own).all() else None)
 
 
 def _parse_number(cell: str, file: Path, field: str) -> float:

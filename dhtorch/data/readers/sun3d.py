@@ -21,9 +21,8 @@ from dhtorch.data.readers import image_table
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
-#: Depth codes of one metre, and bits by which they are rotated. Source: format definition (the data set's toolbox).
+#: Depth codes of one metre. Source: format definition (the data set's toolbox).
 _UNITS_PER_METRE = 1000.0
-_ROTATED_BITS = 3
 
 _INTRINSICS_FILE = "intrinsics.txt"
 
@@ -68,47 +67,33 @@ def read(
     """
     root = Path(root)
     images, depths = image_table.list_images(root / "image"), image_table.list_images(root / "depth")
-    pairs = image_table.pair_folders(root, images, depths, None)
-    if not pairs.rows:
-        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "one for each image")
-    poses, poses_file, report = _read_extrinsics(root, len(images))
-    rows = tuple(replace(row, c2w=poses.get(row.number)) for row in pairs.rows)
-    hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
+    rows, report = image_table.pair_folders(root, images, depths, None)
+    tables = sorted((root / "extrinsics").glob("*.txt"))
+    if tables and len(images) == 1:
+        tables, report = [], [*report, "extrinsics/ holds the tilt of one image, no pose: not read"]
+    if tables:
+        lines = files.read_table(tables[-1], 4)
+        if len(lines) != 3 * len(images):
+            expected = f"{3 * len(images)}, three for each of {len(images)} images"
+            raise FormatError(tables[-1], "lines", len(lines), expected)
+        matrices = np.tile(np.eye(4), (len(images), 1, 1))
+        matrices[:, :3] = lines.reshape(-1, 3, 4)
+        rows = [replace(row, c2w=matrices[row.number]) for row in rows]
     file = root / _INTRINSICS_FILE
-    stated = (image_table.read_K(file), file, "K") if file.is_file() else None
-    camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INTRINSICS_FILE)
-    bits, plain = image_table.choose_rotated_bits(rows[0].depth, rotated, _ROTATED_BITS, "SUN3D's")
-    source = "SUN3D stores mm, rotated by 3 bits" if bits else None
-    loader = image_table.ImageTableLoader(
-        rows=rows,
-        hw=hw,
-        depth_hw=depth_hw,
-        camera=camera,
-        units_per_metre=_UNITS_PER_METRE,
-        rotated_bits=bits,
-    )
+    bits, plain = image_table.choose_rotated_bits(rows[0].depth, rotated, "SUN3D's")
     return [
         image_table.open_image_table(
             root,
             "sun3d",
-            loader,
-            unit=DepthUnit(1 / _UNITS_PER_METRE, source),
-            poses_file=poses_file,
+            rows,
+            (intrinsics, K, fov),
+            stated=(image_table.read_K(file), file, "K", None) if file.is_file() else None,
+            where=_INTRINSICS_FILE,
+            units_per_metre=_UNITS_PER_METRE,
+            unit=DepthUnit(1 / _UNITS_PER_METRE, "SUN3D stores mm, rotated by 3 bits" if bits else None),
+            poses_file=tables[-1] if tables else None,
+            rotated_bits=bits,
             fps=fps,
-            report=[*pairs.report, *report, *plain, *guess],
+            report=[*report, *plain],
         )
     ]
-
-
-def _read_extrinsics(root: Path, n_images: int) -> tuple[dict[int, np.ndarray], Path | None, list[str]]:
-    """Poses by the place of the image, their file, and the report; no poses where they do not belong to the images."""
-    tables = sorted((root / "extrinsics").glob("*.txt"))
-    if not tables or n_images == 1:
-        return {}, None, ["extrinsics/ holds the tilt of one image, no pose: not read"] if tables else []
-    file = tables[-1]
-    rows = files.read_table(file, 4)
-    if len(rows) != 3 * n_images:
-        raise FormatError(file, "lines", len(rows), f"{3 * n_images}, three for each of {n_images} images")
-    matrices = np.tile(np.eye(4), (n_images, 1, 1))
-    matrices[:, :3] = rows.reshape(-1, 3, 4)
-    return dict(enumerate(matrices)), file, []
