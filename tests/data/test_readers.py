@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import pickle
-import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +15,7 @@ import pytest
 import torch
 from support import writers
 from support.box_scene import BOX, CAMERA, HW, check_same, disagreement, hit, off_wall, pose, render, walk, world_points
+from support.capture_cases import DELETE, Case, check_case
 from support.writers import parts
 from torch.utils.data import DataLoader
 
@@ -25,13 +24,12 @@ from dhtorch.data import convert
 from dhtorch.data.codecs import npy
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import driving, frames_dir, rectified, tum
 from dhtorch.data.recording import consecutive_frame_numbers
 from dhtorch.data.scene import Scene
 from dhtorch.export import arrays
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Pose
+from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime import safe_open
 
 # ------------------------------------------------------------------------------------------------ written, then read
@@ -43,18 +41,6 @@ def test_named_frames_give_back_the_scene(tmp_path: Path) -> None:
     recording = data.open(tmp_path)
     assert recording.format == "frames_dir" and recording.rate_hz == 30 and recording.number.tolist() == [0, 1, 2, 3]
     torch.testing.assert_close(recording.times, torch.arange(4).double() / 30)
-    check_same(recording, frames, 1 / 1000)
-
-
-def test_frames_without_numbers_are_counted_from_0() -> None:
-    assert consecutive_frame_numbers(3).tolist() == [0, 1, 2]
-
-
-def test_counted_frames_give_back_the_scene(tmp_path: Path) -> None:
-    frames = walk()
-    writers.write_counted_frames(tmp_path, frames)
-    recording = data.open(tmp_path)
-    assert recording.times is None
     check_same(recording, frames, 1 / 1000)
 
 
@@ -98,10 +84,15 @@ def test_picture_camera_and_pose_turn_together(turns: int) -> None:
     assert torch.equal(convert.rot90_image(image, turns)[v, u], image[y, x])
 
 
-def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
+def stereo_pair() -> list[Frame]:
+    """Frames of a rectified pair with a baseline of 12.5 cm."""
     cams = [Camera(torch.tensor([[60.0, 60.0]]), torch.tensor([[c, 22.25]])) for c in (30.25, 33.5)]
     away = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
-    left, right = render(cams[0], se3.identity(1, BOX), HW), render(cams[1], away, HW)
+    return [render(cams[0], se3.identity(1, BOX), HW), render(cams[1], away, HW)]
+
+
+def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
+    left, right = stereo_pair()
     writers.write_calib_pair(tmp_path / "calib", left, right)
     writers.write_npz_pair(tmp_path / "npz", left, right)
     for name in ("calib", "npz"):
@@ -112,7 +103,7 @@ def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
         frame = recording[1]
         assert not frame.depth.any() and torch.equal(frame.image, right.image)
         assert torch.equal(frame.camera.c, right.camera.c)
-        torch.testing.assert_close(frame.T_world_from_cam.t, away.t, atol=1e-12, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.t, right.T_world_from_cam.t, atol=1e-12, rtol=0)
         assert disagreement(recording[0], right)[0] < 0.005
 
 
@@ -278,6 +269,163 @@ def test_a_point_is_hidden_by_a_much_nearer_one_in_the_square_around_it(reach: i
 # -------------------------------------------------------------------------------------------------------- bad input
 
 
+def still_driving(root: Path, frames: list[Frame]) -> None:
+    lidar = Pose(torch.cat([pose(i).R for i in range(3)]), torch.cat([pose(i).t for i in range(3)]))
+    writers.write_driving(root, {"FRONT": frames}, lidar)
+
+
+def write_calib(root: Path, frames: list[Frame]) -> None:
+    writers.write_calib_pair(root, *frames)
+
+
+def write_npz(root: Path, frames: list[Frame]) -> None:
+    writers.write_npz_pair(root, *frames)
+
+
+def npz(*arrays_: np.ndarray, **named: np.ndarray) -> bytes:
+    """An archive of arrays."""
+    file = io.BytesIO()
+    np.savez(file, *arrays_, **named)
+    return file.getvalue()
+
+
+def poses_with(place: tuple[int, int], value: float) -> str:
+    rows = np.stack([arrays.pose_matrix(frame).ravel() for frame in walk(3)])
+    rows[place] = value
+    return parts.format_rows(rows)
+
+
+COLOUR, DEPTH = "frame-000001.color.png", "frame-000001.depth.png"
+PNG = parts.encode_unfiltered_png(arrays.frame_to_hwc(walk(2)[1]))
+HUGE = PNG[:16] + (60000).to_bytes(4, "big") * 2 + PNG[24:]
+named, counted = writers.write_named_frames, writers.write_counted_frames
+K_60 = '"K": [[60, 0, 30], [0, 60, 20], [0, 0, 1]]'
+SCENE = "scene_0000000000000000000000000000000000000000.json"
+PGM = b"P5\n# a remark\n64 48\n65535\n"
+
+
+def pgm(i: int) -> bytes:
+    return PGM + arrays.encode_depth_codes(walk(i + 1)[i].depth, 1000).astype(">u2").tobytes()
+
+
+def datum(k: int, **change: object) -> tuple[str, object]:
+    """An edit of an entry of a scene of DGP."""
+    return SCENE, {"data": {k: change}}
+
+
+CASES = [
+    # images
+    *(Case(f"{file} {k}", named, 3, [(file, content)], error=message) for k, (file, content, message) in enumerate((
+        (COLOUR, PNG[: len(PNG) // 2],
+         r"frame-000001.color.png: data: found a truncated or damaged png file of \d+ bytes, expected a whole file"),
+        (COLOUR, PNG[:60] + bytes([PNG[60] ^ 1]) + PNG[61:], r"color.png: data: found a truncated or damaged"),
+        (COLOUR, b"", r"color.png: file size: found 0 bytes"),
+        (COLOUR, b"GIF89a" + bytes(40), r"color.png: content: found b'GIF89a.*expected a PNG or JPEG image"),
+        (COLOUR, np.zeros((10, 12, 3), np.uint8), r"color.png: size: found 12x10, expected 64x48"),
+        (COLOUR, np.zeros(HW, np.uint16), r"color.png: bits per channel: found 16, expected 8"),
+        (COLOUR, HUGE, r"color.png: size: found 60000x60000, expected 1 to 64000000 pixels"),
+        (DEPTH, np.zeros((*HW, 1), np.uint8),
+         r"depth.png: depth: found png with 1 channels of 8 bits, expected png with 1 channel of 16 bits"),
+        (DEPTH, PNG, r"depth.png: depth: found png with 3 channels of 8 bits"),
+        (DEPTH, np.zeros((24, 32), np.uint16), r"depth.png: size: found 32x24, expected 64x48")))),
+    # numbered frames
+    Case("an incomplete frame", named, 3, [(DEPTH, DELETE)],
+         {"number": [0, 2], "report": ("frame 1: no depth: left out",), "same": ([0, 2], 1e-3)}),
+    Case("no whole frame", named, 3, [("*.depth.png", DELETE)],
+         error=r"frames: found none complete among 3, expected frame-XXXXXX"),
+    Case("counted frames have no times", counted, 4, (), {"times": None, "same": ([0, 1, 2, 3], 1e-3)}),
+    Case("fewer poses", counted, 3, [("poses.txt", lambda text: "\n".join(text.splitlines()[:2]))],
+         error=r"poses.txt count: found 2, expected 3, one for each file of images/"),
+    Case("another name", counted, 3, [("depth/00001.png", Path("depth/00007.png"))],
+         error=r"file names: found 00001 in one of images/ and depth/, expected the same names in both"),
+    Case("fewer depth maps", counted, 3, [("depth/00001.png", DELETE)], error=r"depth count: found 2, expected 3"),
+    Case("no image", counted, 3, [("images/*", DELETE)], error=r"images: frames: found no image",
+         options={"format": "frames_dir"}),
+    Case("a pose that is no rotation", counted, 3, [("poses.txt", poses_with((1, 0), 5))],
+         error=r"poses.txt: pose 1 determinant: found .*, expected 1 \(a rotation\)"),
+    Case("a pose of another scale", counted, 3, [("poses.txt", poses_with((1, 15), 2))],
+         error=r"poses.txt: pose 1 last row: found \[0.0, 0.0, 0.0, 2.0\], expected 0 0 0 1"),
+    Case("poses of three numbers", counted, 3, [("poses.txt", "1 2 3\n" * 3)],
+         error=r"poses.txt: columns: found 3, expected 16 \(4x4 by rows\) or 7"),
+    Case("poses of six numbers", counted, 3, [("poses.txt", DELETE), ("pose.txt", "0 0 0 0 0 0\n" * 3)],
+         error="pose.txt: columns: found 6"),
+    Case("poses of words", counted, 3, [("poses.txt", " ".join(["one"] * 16))], error=r"poses.txt: line 1: found one one"),
+    Case("no poses", counted, 3, [("poses.txt", DELETE)], {"posed": False, "report": ("no poses.txt: no poses",)},
+         options={"format": "frames_dir"}),
+    Case("numbers of two digits, in color/", counted, 3,
+         [(f"{folder}/{i:05d}.png", Path(f"{to}/{8 + i}.png")) for folder, to in (("images", "color"), ("depth", "depth"))
+          for i in range(3)],
+         {"number": [8, 9, 10], "same": ([0, 1, 2], 1e-3)}),
+    Case("depth as 16-bit grey maps", counted, 2,
+         [(f"depth/{i:05d}.png", DELETE) for i in range(2)] + [(f"depth/{i:05d}.pgm", pgm(i)) for i in range(2)],
+         {"same": ([0, 1], 1e-3)}),
+    Case("a short grey map", counted, 1, [("depth/00000.png", DELETE), ("depth/00000.pgm", pgm(0)[:-1])],
+         error="00000.pgm: data: found 6143 bytes, expected 2 for each of 64x48 pixels"),
+    *(Case(f"K {text!r}", counted, 3, [("K.txt", text)], error=message) for text, message in (
+        ("nan 0 30\n0 60 20\n0 0 1", r"K.txt: K: found \[\[nan, .*expected 3x3 finite numbers"),
+        ("0 0 30\n0 60 20\n0 0 1", r"K.txt: K focal length: found \[0.0, 60.0\], expected two positive"),
+        ("60 0 3000\n0 60 20\n0 0 1",
+         r"K.txt: K principal point: found \[3000.0, 20.0\], expected a place near the 64x48"),
+        ("60 9 30\n0 60 20\n0 0 1", r"K.txt: K: found .*no skew"),
+        ("60 0 30\n0 60 20", r"K.txt: K: found 6 numbers, expected fx fy cx cy, or a 3x3 or 4x4 matrix"))),
+    Case("no K", counted, 3, [("K.txt", DELETE)], error=r"K: found no intrinsics, expected data.fov=69"),
+    Case("no K, an option", counted, 3, [("K.txt", DELETE)], {"f": [60, 61]}, options={"K": (60, 61, 30, 20)}),
+    Case("an option of two numbers", counted, 3, [("K.txt", DELETE)], options={"K": (60, 61)},
+         error=r"option K: found \[60.0, 61.0\], expected 4 finite numbers"),
+    *(Case(f"meta.json {text[:60]}", counted, 3, [("meta.json", text)], error=message) for text, message in (
+        (f'{{{K_60}, "dist": [1, 2]}}', r"distortion: found \[1, 2\], expected 4, 5 or 8 numbers"),
+        ('{"K": ', r"meta.json: JSON: found Expecting value"), ("[" * 100000, r"meta.json: JSON: "),
+        (f'{{{K_60}, "depth_scale": -1}}', r"meta.json: depth_scale: found -1.0, expected a positive number"))),
+    # pairs
+    *(Case(f"calib.txt {old} {new}", write_calib, stereo_pair, [("calib.txt", [(old, new)])], error=message)
+      for old, new, message in (
+          ("doffs=3.25", "doffs=9", r"calib.txt: doffs: found 9.0, expected 3.25, the difference of the principal points"),
+          ("baseline=125.0", "baseline=0", r"calib.txt: baseline: found 0.0, expected a positive length"),
+          ("baseline=125.0", "", r"calib.txt: baseline: found nothing, expected a finite number"),
+          ("width=64", "width=65", r"calib.txt: width and height: found 65x48, expected 64x48, as im0.png"),
+          ("cam1=[60.0", "cam1=[50.0", r"calib.txt: focal length: found .*, expected equal ones"),
+          ("cam0=[", "cam0=[x", r"calib.txt: cam0: found "))),
+    *(Case(f"disp0.pfm {k}", write_calib, stereo_pair, [("disp0.pfm", content)], error=message)
+      for k, (content, message) in enumerate((
+          (b"Pf\n64 48\n-1\n" + bytes(12287), r"disp0.pfm: data: found 12287 bytes, expected 4 for each of 64x48 pixels"),
+          (b"PF\n64 48\n-1\n" + bytes(12288), r"disp0.pfm: header: found b'PF"),
+          (b"Pf\n48 64\n-1\n" + bytes(12288), r"disp0.pfm: size: found 48x64, expected 64x48"),
+          (DELETE, r"disp0.pfm: file: found no such file, expected a disparity map")))),
+    *(Case(f"scene_disp.npz {k}", write_npz, stereo_pair, [("scene_disp.npz", content)], error=message)
+      for k, (content, message) in enumerate((
+          (npz(np.zeros(HW))[:100], r"scene_disp.npz: archive: found .*, expected a whole zip archive"),
+          (npz(np.array([{"a": 1}], dtype=object)), r"scene_disp.npz: arr_0 dtype: found object, expected real numbers"),
+          (npz(other=np.zeros(HW)), r"scene_disp.npz: key: found other.npy, expected arr_0.npy"),
+          (npz(np.zeros((3, 3))), r"scene_disp.npz: arr_0: found shape \(3, 3\), expected \(48, 64\), as the image")))),
+    Case("an npz pair without meta.json", write_npz, stereo_pair, [("meta.json", DELETE)],
+         error=r"meta.json: file: found no such file"),
+    # driving
+    *(Case(f"driving {message[:50]}", still_driving, 3, edits, error=message, options=options)
+      for edits, options, message in (
+          ([datum(1, datum={"image": {"pose": {"rotation": {"qw": None}}}})], {},
+           r"scene_0+.json: pose.rotation: found .*, expected 4 finite numbers"),
+          ([datum(1, datum={"image": {"pose": {"rotation": dict.fromkeys(("qx", "qy", "qz", "qw"), 0)}}})], {},
+           r"pose.rotation 0: found \[0.0, 0.0, 0.0, 0.0\], expected four numbers, not all zero"),
+          ([datum(1, datum={"image": {"filename": "/etc/passwd"}})], {},
+           r"filename: found /etc/passwd, expected a file inside the scene's folder"),
+          ([datum(1, id={"timestamp": "noon"})], {}, r"id.timestamp: found noon, expected an ISO 8601 time"),
+          ([(SCENE, {"samples": DELETE})], {}, r"samples: found nothing, expected a list"),
+          ([datum(0, datum={"point_cloud": {"point_format": ["X", "Y", "INTENSITY"]}})], {},
+           r"npz: data: found shape \(\d+, 4\), expected points with columns X, Y, INTENSITY"),
+          ([], {"crop_bottom": 1.5}, r"option crop_bottom: found 1.5"),
+          ([], {"cameras": ["REAR"]}, r"cameras: found REAR, expected images of FRONT"),
+          ([("calibration/*.json", '{"names": ["LIDAR"], "intrinsics": [{}]}')], {},
+           r"names: found LIDAR, expected FRONT among as many names as intrinsics"))),
+    Case("an instant without its sweep", still_driving, 3, [("point_cloud/LIDAR/000001.npz", DELETE)],
+         {"number": [0, 2], "report": ("FRONT: instant 1 lacks its image or its sweep: left out",)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
+
+
 def fails(message: str, *args: object, **options: object) -> None:
     """Opening, and reading every frame, ends in one line that contains ``message`` (a regular expression)."""
     with pytest.raises(ValueError, match=message) as caught:
@@ -286,19 +434,9 @@ def fails(message: str, *args: object, **options: object) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.fixture
-def named(tmp_path: Path) -> Path:
-    writers.write_named_frames(tmp_path, walk(3))
-    return tmp_path
-
-
-@pytest.fixture
-def counted(tmp_path: Path) -> Path:
-    writers.write_counted_frames(tmp_path, walk(3))
-    return tmp_path
-
-
-def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
+def test_nothing_there_or_unknown(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    writers.write_named_frames(scene, walk(3))
     fails(r"nowhere: path: found no such file or folder, expected a capture", tmp_path / "nowhere")
     fails(r"nowhere: path: found no such file or folder, expected a tum capture", tmp_path / "nowhere", "tum")
     (tmp_path / "empty").mkdir()
@@ -311,72 +449,37 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     )
     for format in data.FORMATS:  # also where the reader is named and the path is a file
         fails(r"scan.xyz", tmp_path / "scan.xyz", format)
-    fails(rf"format: found kitti, expected auto, {every}", named, "kitti")
+    fails(rf"format: found kitti, expected auto, {every}", scene, "kitti")
     fails(
         r"data: format frames_dir has no option 'unit', expected one of intrinsics, K, fov, K_depth, distortion",
-        named,
+        scene,
         unit=3,
     )
-    fails(r"scene_\*.json: found 0 such files, expected exactly one", named, "driving")
-    fails(r"rgb frames: found none", named, "tum")
-    fails(r"calib.txt|left.png: found 0 such files", named, "rectified")
+    fails(r"scene_\*.json: found 0 such files, expected exactly one", scene, "driving")
+    fails(r"rgb frames: found none", scene, "tum")
+    fails(r"calib.txt|left.png: found 0 such files", scene, "rectified")
     fails(r"frames: found none, expected frame-XXXXXX", tmp_path / "empty", "frames_dir")
-    assert data.recognise(named) == ("frames_dir", "frame-XXXXXX.{color,depth,pose} files")
+    assert data.recognise(scene) == ("frames_dir", "frame-XXXXXX.{color,depth,pose} files")
 
 
-def test_scenes_need_their_root(named: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes = [{"path": named.name, "near": 2.0, "gap": 1}, {"path": named.name, "format": "frames_dir", "levels": 6}]
+def test_scenes_need_their_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tmp_path / "scene"
+    writers.write_named_frames(scene, walk(3))
+    scenes = [{"path": scene.name, "near": 2.0, "gap": 1}, {"path": scene.name, "format": "frames_dir", "levels": 6}]
     monkeypatch.delenv("DHTORCH_DATA", raising=False)
     with pytest.raises(FormatError, match="DHTORCH_DATA: environment variable: found nothing, expected the folder"):
         data.open_scenes(scenes=scenes)
-    monkeypatch.setenv("DHTORCH_DATA", str(named / "gone"))
+    monkeypatch.setenv("DHTORCH_DATA", str(scene / "gone"))
     with pytest.raises(FormatError, match=r"gone: path: found no such folder, .*DHTORCH_DATA"):
         data.open_scenes(scenes=scenes)
-    monkeypatch.setenv("DHTORCH_DATA", str(named.parent))
+    monkeypatch.setenv("DHTORCH_DATA", str(scene.parent))
     first, second = data.open_scenes(scenes=scenes)
     assert (first.near, first.gap, second.levels, second.gap) == (2.0, 1, 6, None)
     with pytest.raises(FormatError, match="scenes: found none"):
-        data.open_scenes(named)
-    for scene in ({"near": 2.0}, "holo_a"):
+        data.open_scenes(scene)
+    for entry in ({"near": 2.0}, "holo_a"):
         with pytest.raises(FormatError, match=r"scenes: found .*expected entries with a path, as \{path:holo_a"):
-            data.open_scenes(named, [scene])
-
-
-def test_damaged_pictures(named: Path) -> None:
-    colour, depth = named / "frame-000001.color.png", named / "frame-000001.depth.png"
-    good_colour, good_depth = colour.read_bytes(), depth.read_bytes()
-    colour.write_bytes(good_colour[: len(good_colour) // 2])
-    fails(
-        r"frame-000001.color.png: data: found a truncated or damaged png file of \d+ bytes, expected a whole file",
-        named,
-    )
-    colour.write_bytes(good_colour[:60] + bytes([good_colour[60] ^ 1]) + good_colour[61:])
-    fails(r"color.png: data: found a truncated or damaged", named)
-    colour.write_bytes(b"")
-    fails(r"color.png: file size: found 0 bytes", named)
-    colour.write_bytes(b"GIF89a" + bytes(40))
-    fails(r"color.png: content: found b'GIF89a.*expected a PNG or JPEG image", named)
-    colour.write_bytes(parts.encode_unfiltered_png(np.zeros((10, 12, 3), np.uint8)))
-    fails(r"color.png: size: found 12x10, expected 64x48", named)
-    colour.write_bytes(parts.encode_unfiltered_png(np.zeros(HW, np.uint16)))
-    fails(r"color.png: bits per channel: found 16, expected 8", named)
-    colour.write_bytes(good_colour)
-    depth.write_bytes(parts.encode_unfiltered_png(np.zeros((*HW, 1), np.uint8)))
-    fails(r"depth.png: depth: found png with 1 channels of 8 bits, expected png with 1 channel of 16 bits", named)
-    depth.write_bytes(good_colour)
-    fails(r"depth.png: depth: found png with 3 channels of 8 bits", named)
-    depth.write_bytes(parts.encode_unfiltered_png(np.zeros((24, 32), np.uint16)))
-    fails(r"depth.png: size: found 32x24, expected 64x48", named)
-    depth.write_bytes(good_depth)
-    assert len(list(data.open(named))) == 3
-
-
-def test_absurd_header_is_refused_before_decoding(named: Path) -> None:
-    file = named / "frame-000000.color.png"
-    whole = bytearray(file.read_bytes())
-    whole[16:24] = (60000).to_bytes(4, "big") * 2
-    file.write_bytes(whole)
-    fails(r"color.png: size: found 60000x60000, expected 1 to 64000000 pixels", named)
+            data.open_scenes(scene, [entry])
 
 
 def test_jpeg_must_be_whole(tmp_path: Path) -> None:
@@ -405,125 +508,6 @@ def test_colours_are_red_green_blue_and_depth_codes_are_masked(tmp_path: Path) -
     np.testing.assert_allclose(depth, [[0, 0, 1.234]])
 
 
-def test_incomplete_named_frame_is_left_out_and_reported(named: Path) -> None:
-    (named / "frame-000001.depth.png").unlink()
-    recording = data.open(named)
-    assert recording.number.tolist() == [0, 2] and recording.report == ("frame 1: no depth: left out",)
-    assert torch.equal(recording[1].T_world_from_cam.t, recording.poses.t[1:])
-    for file in named.glob("*.depth.png"):
-        file.unlink()
-    fails(r"frames: found none complete among 3, expected frame-XXXXXX", named)
-
-
-def test_counted_frames_must_agree(counted: Path) -> None:
-    rows = (counted / "poses.txt").read_text().splitlines()
-    (counted / "poses.txt").write_text("\n".join(rows[:2]))
-    fails(r"poses.txt count: found 2, expected 3, one for each file of images/", counted)
-    (counted / "poses.txt").write_text("\n".join(rows))
-    shutil.move(counted / "depth" / "00001.png", counted / "depth" / "00007.png")
-    fails(r"file names: found 00001 in one of images/ and depth/, expected the same names in both", counted)
-    (counted / "depth" / "00007.png").unlink()
-    fails(r"depth count: found 2, expected 3", counted)
-    for file in (counted / "images").iterdir():
-        file.unlink()
-    fails(r"images: frames: found no image", counted, "frames_dir")
-
-
-def test_bad_poses(counted: Path) -> None:
-    file = counted / "poses.txt"
-    rows = np.loadtxt(file)
-    for column, value, message in (
-        (0, "5", r"poses.txt: pose 1 determinant: found .*, expected 1 \(a rotation\)"),
-        (15, "2", r"poses.txt: pose 1 last row: found \[0.0, 0.0, 0.0, 2.0\], expected 0 0 0 1"),
-    ):
-        bad = rows.copy()
-        bad[1, column] = float(value)
-        np.savetxt(file, bad)
-        fails(message, counted)
-    file.write_text("1 2 3\n" * len(rows))
-    fails(r"poses.txt: columns: found 3, expected 16 \(4x4 by rows\) or 7", counted)
-    file.write_text(" ".join(["one"] * 16))
-    fails(r"poses.txt: line 1: found one one", counted)
-    file.unlink()
-    unplaced = data.open(counted, "frames_dir")
-    assert unplaced.poses is None and "no poses.txt: no poses" in unplaced.report
-
-
-def test_bad_intrinsics(counted: Path) -> None:
-    file = counted / "K.txt"
-    for text, message in (
-        ("nan 0 30\n0 60 20\n0 0 1", r"K.txt: K: found \[\[nan, .*expected 3x3 finite numbers"),
-        ("0 0 30\n0 60 20\n0 0 1", r"K.txt: K focal length: found \[0.0, 60.0\], expected two positive"),
-        (
-            "60 0 3000\n0 60 20\n0 0 1",
-            r"K.txt: K principal point: found \[3000.0, 20.0\], expected a place near the 64x48",
-        ),
-        ("60 9 30\n0 60 20\n0 0 1", r"K.txt: K: found .*no skew"),
-        ("60 0 30\n0 60 20", r"K.txt: K: found 6 numbers, expected fx fy cx cy, or a 3x3 or 4x4 matrix"),
-    ):
-        file.write_text(text)
-        fails(message, counted)
-    file.unlink()
-    fails(r"K: found no intrinsics, expected data.fov=69", counted)
-    assert data.open(counted, K=(60, 61, 30, 20))[0].camera.f.tolist() == [[60, 61]]
-    fails(r"option K: found \[60.0, 61.0\], expected 4 finite numbers", counted, K=(60, 61))
-    (counted / "meta.json").write_text('{"K": [[60, 0, 30], [0, 60, 20], [0, 0, 1]], "dist": [1, 2]}')
-    fails(r"distortion: found \[1, 2\], expected 4, 5 or 8 numbers", counted)
-    (counted / "meta.json").write_text('{"K": ')
-    fails(r"meta.json: JSON: found Expecting value", counted)
-    (counted / "meta.json").write_text("[" * 100000)
-    fails(r"meta.json: JSON: ", counted)
-    (counted / "meta.json").write_text('{"K": [[60, 0, 30], [0, 60, 20], [0, 0, 1]], "depth_scale": -1}')
-    fails(r"meta.json: depth_scale: found -1.0, expected a positive number", counted)
-
-
-def test_bad_pairs_and_arrays(tmp_path: Path) -> None:
-    cams = [Camera(torch.tensor([[60.0, 60.0]]), torch.tensor([[c, 22.25]])) for c in (30.25, 33.5)]
-    away = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
-    left, right = render(cams[0], se3.identity(1, BOX), HW), render(cams[1], away, HW)
-    calib, npz = tmp_path / "calib", tmp_path / "npz"
-    writers.write_calib_pair(calib, left, right)
-    writers.write_npz_pair(npz, left, right)
-    text, map_ = (calib / "calib.txt").read_text(), (calib / "disp0.pfm").read_bytes()
-    for old, new, message in (
-        (
-            "doffs=3.25",
-            "doffs=9",
-            r"calib.txt: doffs: found 9.0, expected 3.25, the difference of the principal points",
-        ),
-        ("baseline=125.0", "baseline=0", r"calib.txt: baseline: found 0.0, expected a positive length"),
-        ("baseline=125.0", "", r"calib.txt: baseline: found nothing, expected a finite number"),
-        ("width=64", "width=65", r"calib.txt: width and height: found 65x48, expected 64x48, as im0.png"),
-        ("cam1=[60.0", "cam1=[50.0", r"calib.txt: focal length: found .*, expected equal ones"),
-        ("cam0=[", "cam0=[x", r"calib.txt: cam0: found "),
-    ):
-        assert old in text
-        (calib / "calib.txt").write_text(text.replace(old, new))
-        fails(message, calib)
-    (calib / "calib.txt").write_text(text)
-    for content, message in (
-        (map_[:-1], r"disp0.pfm: data: found 12287 bytes, expected 4 for each of 64x48 pixels"),
-        (b"PF" + map_[2:], r"disp0.pfm: header: found b'PF"),
-        (map_.replace(b"64 48", b"48 64"), r"disp0.pfm: size: found 48x64, expected 64x48"),
-    ):
-        (calib / "disp0.pfm").write_bytes(content)
-        fails(message, calib)
-    (calib / "disp0.pfm").unlink()
-    fails(r"disp0.pfm: file: found no such file, expected a disparity map", calib)
-    archive = npz / "scene_disp.npz"
-    good = archive.read_bytes()
-    archive.write_bytes(good[:100])
-    fails(r"scene_disp.npz: archive: found .*, expected a whole zip archive", npz)
-    np.savez(archive, np.array([{"a": 1}], dtype=object))
-    fails(r"scene_disp.npz: arr_0 dtype: found object, expected real numbers", npz)
-    np.savez(archive, other=np.zeros(HW))
-    fails(r"scene_disp.npz: key: found other.npy, expected arr_0.npy", npz)
-    np.savez(archive, np.zeros((3, 3)))
-    fails(r"scene_disp.npz: arr_0: found shape \(3, 3\), expected \(48, 64\), as the image", npz)
-    (npz / "meta.json").unlink()
-    fails(r"meta.json: file: found no such file", npz)
-
-
 def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
@@ -538,79 +522,7 @@ def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
         npy.read_npz(tmp_path / "big.npz", "data")
 
 
-def test_bad_driving(tmp_path: Path) -> None:
-    lidar = Pose(torch.cat([pose(i).R for i in range(3)]), torch.cat([pose(i).t for i in range(3)]))
-    writers.write_driving(tmp_path, {"FRONT": walk(3)}, lidar)
-    scene = next(tmp_path.glob("scene_*.json"))
-    good = json.loads(scene.read_text())
-
-    def edited(change: object) -> None:
-        copy = json.loads(json.dumps(good))
-        change(copy)
-        scene.write_text(json.dumps(copy))
-
-    edited(lambda s: s["data"][1]["datum"]["image"]["pose"]["rotation"].update(qw=None))
-    fails(r"scene_0+.json: pose.rotation: found .*, expected 4 finite numbers", tmp_path)
-    edited(lambda s: s["data"][1]["datum"]["image"]["pose"].update(rotation=dict.fromkeys(("qx", "qy", "qz", "qw"), 0)))
-    fails(r"pose.rotation 0: found \[0.0, 0.0, 0.0, 0.0\], expected four numbers, not all zero", tmp_path)
-    edited(lambda s: s["data"][1]["datum"]["image"].update(filename="/etc/passwd"))
-    fails(r"filename: found /etc/passwd, expected a file inside the scene's folder", tmp_path)
-    edited(lambda s: s["data"][1]["id"].update(timestamp="noon"))
-    fails(r"id.timestamp: found noon, expected an ISO 8601 time", tmp_path)
-    edited(lambda s: s.pop("samples"))
-    fails(r"samples: found nothing, expected a list", tmp_path)
-    edited(lambda s: s["data"][0]["datum"]["point_cloud"].update(point_format=["X", "Y", "INTENSITY"]))
-    fails(r"npz: data: found shape \(\d+, 4\), expected points with columns X, Y, INTENSITY", tmp_path)
-    edited(lambda s: None)
-    fails(r"option crop_bottom: found 1.5", tmp_path, crop_bottom=1.5)
-    fails(r"cameras: found REAR, expected images of FRONT", tmp_path, cameras=["REAR"])
-    (tmp_path / "point_cloud" / "LIDAR" / "000001.npz").unlink()
-    recording = data.open(tmp_path)
-    assert recording.number.tolist() == [0, 2]
-    assert recording.report == ("FRONT: instant 1 lacks its image or its sweep: left out",)
-    next((tmp_path / "calibration").iterdir()).write_text('{"names": ["LIDAR"], "intrinsics": [{}]}')
-    fails(r"names: found LIDAR, expected FRONT among as many names as intrinsics", tmp_path)
-
-
 def test_format_error_survives_pickling() -> None:
     error = pickle.loads(pickle.dumps(FormatError(Path("a/b.png"), "size", "1x1", "2x2")))
     assert str(error) == "a/b.png: size: found 1x1, expected 2x2"
     assert len(str(FormatError("a", "f", "x" * 1000 + "\n", "y"))) < 200
-
-
-def test_every_format_has_the_two_functions() -> None:
-    for module in (driving, frames_dir, rectified, tum):
-        assert module in data.FORMATS.values()
-    for module in data.FORMATS.values():
-        assert callable(module.recognise) and callable(module.read)
-
-
-def test_numbered_folders_without_poses_and_with_grey_maps(tmp_path: Path) -> None:
-    """8, 9, 10 in this order; depth as 16-bit PGM; poses as seven numbers a line, or none."""
-    shots = walk(3, hw=(24, 32))
-    writers.write_counted_frames(tmp_path, shots)
-    for kind, ending in (("images", "png"), ("depth", "png")):
-        for i, file in enumerate(sorted((tmp_path / kind).iterdir())):
-            file.rename(tmp_path / kind / f"{8 + i}.{ending}")
-    (tmp_path / "images").rename(tmp_path / "color")
-    numbered = data.open(tmp_path)
-    assert numbered.number.tolist() == [8, 9, 10] and numbered.poses is not None
-    want = list(numbered)
-    for file in sorted((tmp_path / "depth").iterdir()):
-        code = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        file.unlink()
-        head = b"P5\n# a remark\n32 24\n65535\n"
-        file.with_suffix(".pgm").write_bytes(head + code.astype(">u2").tobytes())
-    (tmp_path / "poses.txt").unlink()
-    bare = data.open(tmp_path)
-    assert bare.poses is None and bare.report == ("no poses.txt: no poses",)
-    assert all(torch.equal(a.depth, b.depth) and torch.equal(a.image, b.image) for a, b in zip(bare, want, strict=True))
-    (tmp_path / "pose.txt").write_text("0 0 0 0 0 0 1\n" * 3)
-    unturned = data.open(tmp_path).poses
-    assert unturned is not None and bool((unturned.R - torch.eye(3).double() == 0).all())
-    (tmp_path / "pose.txt").write_text("0 0 0 0 0 0\n" * 3)
-    fails("pose.txt: columns: found 6", tmp_path)
-    (tmp_path / "pose.txt").unlink()
-    grey = tmp_path / "depth" / "8.pgm"
-    grey.write_bytes(grey.read_bytes()[:-1])
-    fails("8.pgm: data: found 1535 bytes, expected 2 for each of 32x24 pixels", tmp_path)

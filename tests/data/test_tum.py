@@ -9,11 +9,11 @@ import pytest
 import torch
 from support import writers
 from support.box_scene import CAMERA, HW, check_same, pose, walk
+from support.capture_cases import DELETE, Case, check_case
 from support.writers import parts
 
 from dhtorch import data
 from dhtorch.data.readers import tum
-from dhtorch.data.units import DepthUnit
 from dhtorch.export import arrays
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
@@ -30,16 +30,6 @@ def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
     check_same(recording, frames, 1 / 5000)
 
 
-def test_a_validation_twin_has_no_poses_and_other_files_are_passed_over(tmp_path: Path) -> None:
-    root = tmp_path / "rgbd_dataset_freiburg3_walking_xyz_validation"
-    writers.write_tum(root, blank(2), camera=3)
-    (root / "groundtruth.txt").unlink()
-    (root / "accelerometer.txt").write_text("# timestamp ax ay az\n100.0 0.1 9.8\nnot a number\n")
-    recording = data.open(root)
-    assert len(recording) == 2 and recording.poses is None and recording.report == ()
-    assert float(recording[0].camera.f[0, 0]) == pytest.approx(535.4)
-
-
 def test_the_largest_code_is_no_depth(tmp_path: Path) -> None:
     writers.write_tum(tmp_path, walk(1))
     codes = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
@@ -47,9 +37,6 @@ def test_the_largest_code_is_no_depth(tmp_path: Path) -> None:
     depth = data.open(tmp_path)[0].depth[0]
     assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 0])
     assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
-    (tmp_path / "meta.json").write_text('{"depth_scale": 4000}')
-    unit = tum._find_unit(tmp_path, None, tum._CameraSource(CAMERA))
-    assert unit == DepthUnit(1 / 4000, "meta.json: depth_scale")
 
 
 def blank(n: int) -> list[Frame]:
@@ -88,20 +75,6 @@ def test_association_is_one_to_one_and_closest_first() -> None:
     assert tum.associate(list(a), list(b), 0.05) == sorted(taken.items())
 
 
-def test_tum_bridges_no_gap_of_the_trajectory(tmp_path: Path) -> None:
-    frames = walk(4)
-    frames = [f.replace(time=torch.tensor([100.0 + 0.5 * i], dtype=torch.float64)) for i, f in enumerate(frames)]
-    writers.write_tum(tmp_path, frames)
-    lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
-    lines[4] = lines[4].split()[0] + " nan nan nan nan nan nan nan"  # lost at frame 1
-    lines[5] = lines[5].split()[0] + " 0 0 0 0 0 0 0"  # and, differently said, at frame 2
-    (tmp_path / "groundtruth.txt").write_text("\n".join(lines))
-    recording = data.open(tmp_path)
-    assert recording.number.tolist() == [0, 3]
-    assert recording.report == ("2 RGB-D frames without a pose within 0.02 s: left out",)
-    assert len(data.open(tmp_path, poses=False)) == 4
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path, sign: int) -> None:
     writers.write_tum(tmp_path, walk(2))
@@ -118,49 +91,65 @@ def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path, sign: int) 
     assert float(se3.rotation_angle(a.R.mT @ recording.poses.R) / full) == pytest.approx(0.25, abs=0.002)
 
 
-def fails(message: str, *args: object, **options: object) -> None:
-    """Opening, and reading every frame, ends in one line that contains ``message`` (a regular expression)."""
-    with pytest.raises(ValueError, match=message) as caught:
-        for recording in data.open_all(*args, **options):
-            list(recording)
-    assert "\n" not in str(caught.value)
+def lose(text: str) -> str:
+    """A trajectory that was lost at frames 1 and, differently written, 2."""
+    lines = text.splitlines()
+    lines[4] = lines[4].split()[0] + " nan nan nan nan nan nan nan"
+    lines[5] = lines[5].split()[0] + " 0 0 0 0 0 0 0"
+    return "\n".join(lines)
 
 
-def test_bad_tum(tmp_path: Path) -> None:
-    writers.write_tum(tmp_path, blank(3), camera=1)
-    good = {name: (tmp_path / name).read_text() for name in ("rgb.txt", "depth.txt", "groundtruth.txt")}
+def slow() -> list[Frame]:
+    return [f.replace(time=torch.tensor([100.0 + 0.5 * i]).double()) for i, f in enumerate(walk(4))]
 
-    def restore() -> None:
-        for name, text in good.items():
-            (tmp_path / name).write_text(text)
 
-    (tmp_path / "depth.txt").write_text(good["depth.txt"].replace("100.", "900.", 1))
-    recording = data.open(tmp_path)
-    assert len(recording) == 2 and recording.report == ("1 images without a depth map within 0.02 s: left out",)
-    lagging = good["depth.txt"].replace("\n1", "\n7")
-    (tmp_path / "depth.txt").write_text(lagging)
-    fails(r"time stamps: found 3 images and 3 depth maps, none within 0.02 s of one another, expected pairs", tmp_path)
-    restore()
-    (tmp_path / "groundtruth.txt").write_text(good["groundtruth.txt"].replace("\n100", "\n500"))
-    fails(r"groundtruth.txt: time stamps: found no pose within 0.02 s of any image, expected overlapping", tmp_path)
-    (tmp_path / "groundtruth.txt").write_text("# freiburg1\n")
-    fails(r"groundtruth.txt: poses: found no usable row", tmp_path)
-    (tmp_path / "groundtruth.txt").write_text("# freiburg1\n1 2 3\n")
-    fails(r"groundtruth.txt: line 2: found 3 columns, expected 8 numbers", tmp_path)
-    (tmp_path / "groundtruth.txt").unlink()
-    fails(r"K: found no intrinsics, expected data.fov=69 .*data.camera=1, 2, 3 \(freiburg\) or icl", tmp_path)
-    with pytest.warns(UserWarning, match="intrinsics are a guess from a field of view of 90°"):
-        (guess,) = data.open_all(tmp_path, fov=90)
-    assert float(guess[0].camera.f[0, 0]) == pytest.approx(guess[0].hw[1] / 2) and "are a guess" in guess.report[-1]
-    assert data.open(tmp_path, intrinsics=[40, 41, 30, 20])[0].camera.f.tolist() == [[40, 41]]
-    assert data.open(tmp_path, camera=2).poses is None
-    fails(r"option camera: found 4, expected 1, 2, 3 or icl", tmp_path, camera=4)
-    fails(r"option intrinsics: found default, expected camera or ros", tmp_path, intrinsics="default")
-    restore()
-    (tmp_path / "rgb.txt").write_text(good["rgb.txt"].replace("rgb/", "../rgb/"))
-    fails(r"rgb.txt: line 2: found ../rgb/.*, expected a file inside the sequence's folder", tmp_path)
-    (tmp_path / "rgb.txt").write_text("soon rgb/1.png\n")
-    fails(r"rgb.txt: line 1: found soon rgb/1.png, expected a time stamp and a file name", tmp_path)
-    restore()
-    next((tmp_path / "rgb").iterdir()).unlink()
-    fails(r"rgb/100.*png: file: found no such file, expected a readable file", tmp_path)
+def write_twin(root: Path, frames: list[Frame], **options: int) -> None:
+    writers.write_tum(root / "rgbd_dataset_freiburg3_walking_xyz_validation", frames, **options)
+
+
+TUM = {"write": writers.write_tum, "frames": lambda: blank(3), "written": {"camera": 1}}
+POSES, NO_POSES = "groundtruth.txt", ("groundtruth.txt", DELETE)
+
+CASES = [
+    Case("a validation twin has no poses", write_twin, lambda: blank(2),
+         [("*/groundtruth.txt", DELETE),
+          ("rgbd_dataset_freiburg3_walking_xyz_validation/accelerometer.txt", "# t ax ay az\n100.0 0.1 9.8\nno number\n")],
+         {"number": [0, 1], "posed": False, "report": (), "f": pytest.approx([535.4, 539.2])}, written={"camera": 3},
+         path="rgbd_dataset_freiburg3_walking_xyz_validation"),
+    Case("depth_scale of meta.json", writers.write_tum, 1,
+         [("meta.json", lambda text: text.replace("{", '{"depth_scale": 4000, ', 1))],
+         {"unit": (1 / 4000, "meta.json: depth_scale")}),
+    Case("no gap of the trajectory is bridged", writers.write_tum, slow, [(POSES, lose)],
+         {"number": [0, 3], "report": ("2 RGB-D frames without a pose within 0.02 s: left out",)}),
+    Case("without poses all are kept", writers.write_tum, slow, [(POSES, lose)], {"number": [0, 1, 2, 3]},
+         options={"poses": False}),
+    Case("one depth map of another time", **TUM, edits=[("depth.txt", lambda text: text.replace("100.", "900.", 1))],
+         expect={"number": [1, 2], "report": ("1 images without a depth map within 0.02 s: left out",)}),
+    Case("depth of another clock", **TUM, edits=[("depth.txt", [("\n1", "\n7")])],
+         error=r"time stamps: found 3 images and 3 depth maps, none within 0.02 s of one another, expected pairs"),
+    Case("poses of another clock", **TUM, edits=[(POSES, [("\n100", "\n500")])],
+         error=r"groundtruth.txt: time stamps: found no pose within 0.02 s of any image, expected overlapping"),
+    Case("no pose", **TUM, edits=[(POSES, "# freiburg1\n")], error=r"groundtruth.txt: poses: found no usable row"),
+    Case("poses of three numbers", **TUM, edits=[(POSES, "# freiburg1\n1 2 3\n")],
+         error=r"groundtruth.txt: line 2: found 3 columns, expected 8 numbers"),
+    Case("no camera", **TUM, edits=[NO_POSES],
+         error=r"K: found no intrinsics, expected data.fov=69 .*data.camera=1, 2, 3 \(freiburg\) or icl"),
+    Case("a field of view", **TUM, edits=[NO_POSES], options={"fov": 90},
+         expect={"f": pytest.approx([320, 320]), "report": ["are a guess"]}),
+    Case("four numbers", **TUM, edits=[NO_POSES], options={"intrinsics": [40, 41, 300, 200]}, expect={"f": [40, 41]}),
+    Case("a camera by number", **TUM, edits=[NO_POSES], options={"camera": 2}, expect={"posed": False}),
+    Case("an unknown camera", **TUM, options={"camera": 4}, error=r"option camera: found 4, expected 1, 2, 3 or icl"),
+    Case("an unknown calibration", **TUM, options={"intrinsics": "default"},
+         error=r"option intrinsics: found default, expected camera or ros"),
+    Case("a file outside", **TUM, edits=[("rgb.txt", [("rgb/", "../rgb/")])],
+         error=r"rgb.txt: line 2: found ../rgb/.*, expected a file inside the sequence's folder"),
+    Case("no stamp", **TUM, edits=[("rgb.txt", "soon rgb/1.png\n")],
+         error=r"rgb.txt: line 1: found soon rgb/1.png, expected a time stamp and a file name"),
+    Case("no image", **TUM, edits=[("rgb/100.000000.png", DELETE)],
+         error=r"rgb/100.*png: file: found no such file, expected a readable file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
