@@ -6,6 +6,7 @@ import inspect
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from omegaconf import OmegaConf
 from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, path, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
-from support.writers import parts
+from support.capture_cases import DELETE, Case, check_case, edit_files
 
 from dhtorch import data
 from dhtorch.cli.run import config_dir
@@ -38,14 +39,6 @@ def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
 
 def stored(root: Path, **options: object) -> data.Recording:
     return data.open(root, "arkitscenes", upright=False, **options)
-
-
-def drop(root: Path, asset: str, time: str) -> None:
-    (found,) = (root / asset).glob(f"*_{time}.*")
-    found.unlink()
-
-
-# ------------------------------------------------------------------------------------------------ written, then read
 
 
 def test_gives_back_the_scene(tmp_path: Path) -> None:
@@ -94,34 +87,112 @@ def test_larger_pictures_find_depth_and_pose_at_other_clocks(tmp_path: Path) -> 
         stored(root, max_difference=0.002)
 
 
-def test_color_is_another_name_of_wide_and_intrinsics_may_be_borrowed(tmp_path: Path) -> None:
+def at(n: int, rate: float = 60, start: float = 100, **options: Any) -> Any:
+    """Frames at a rate."""
+    return lambda: shots(start + np.arange(n) / rate, **options)
+
+
+def write(root: Path, frames: list[Frame], *, trajectory: list[Frame] | None = None, **more: list[Frame]) -> None:
+    """A capture of small images with depth, confidence and poses at the same times, and further assets."""
+    assets = {"lowres_wide": frames, "lowres_depth": frames, **more}
+    writers.write_arkitscenes(root / "1", assets, trajectory=frames if trajectory is None else trajectory)
+
+
+def write_wide(root: Path, frames: list[Frame], *, name: str) -> None:
+    """Large images of another asset."""
     wide = shots(100 + np.arange(3) / 10, cameras.resize(VGA, VGA_HW, (192, 256)), (192, 256))
-    small = shots(100 + np.arange(3) / 10)
-    for name in ("wide", "color"):
-        root = tmp_path / name
-        writers.write_arkitscenes(root, {name: wide, "lowres_depth": small}, trajectory=small)
-        assert torch.equal(stored(root)[1].camera.f, wide[0].camera.f)
-        for file in (root / f"{name}_intrinsics").iterdir():
-            file.unlink()
-        borrowed = stored(root)
-        assert borrowed.report == ("no wide_intrinsics: lowres_wide_intrinsics, scaled",)
-        want = cameras.resize(CAMERA, HW, (192, 256))
-        torch.testing.assert_close(borrowed[1].camera.c, want.c)
-        for file in (root / "lowres_wide_intrinsics").iterdir():
-            file.unlink()
-        with pytest.raises(FormatError, match="wide_intrinsics: found none, also of no other size"):
-            stored(root)
+    writers.write_arkitscenes(root / "1", {name: wide, "lowres_depth": frames}, trajectory=frames)
 
 
-def test_the_largest_is_chosen_by_name(tmp_path: Path) -> None:
-    vga = shots(100 + np.arange(4) / 60, VGA, VGA_HW)
-    capture(tmp_path / "1", vga_wide=vga)
-    assert stored(tmp_path / "1")[0].hw == HW
-    assert stored(tmp_path / "1", image="vga_wide")[0].hw == VGA_HW
-    with pytest.raises(FormatError, match=r"wide: found none, expected <video id>_<seconds>.png"):
-        stored(tmp_path / "1", image="wide")
-    with pytest.raises(FormatError, match="option image: found ultrawide, expected one of lowres_wide, vga_wide, wide"):
-        stored(tmp_path / "1", image="ultrawide")
+def without(rows: tuple[int, ...]) -> Any:
+    return lambda text: "\n".join(row for i, row in enumerate(text.splitlines()) if i not in rows)
+
+
+TRAJ = "1/lowres_wide.traj"
+STORED = {"format": "arkitscenes", "upright": False}
+WIDE = cameras.resize(VGA, VGA_HW, (192, 256)).f[0].tolist()
+BORROWED = cameras.resize(CAMERA, HW, (192, 256)).c[0].tolist()
+NO_POSES = ("3 images without a pose: left out",)
+PINCAM = "64 48 61.5 58.25 33.5 21.75\n"
+
+
+def arkit(name: str, frames: Any, edits: Any = (), expect: Any = None, **more: Any) -> Case:
+    options = STORED | more.pop("options", {})
+    return Case(name, more.pop("write", write), frames, edits, expect or {}, path="1", options=options, **more)
+
+
+def all_vga() -> dict[str, list[Frame]]:
+    return {"vga_wide": shots(100 + np.arange(4) / 60, VGA, VGA_HW)}
+
+
+CASES = [
+    *(arkit(f"{name} is wide", at(3, 10), (), {"f": pytest.approx(WIDE), "report": ()}, write=write_wide,
+            written={"name": name}) for name in ("wide", "color")),
+    *(arkit(f"intrinsics of {name} are borrowed", at(3, 10), [(f"1/{name}_intrinsics/*", DELETE)],
+            {"c": pytest.approx(BORROWED), "report": ("no wide_intrinsics: lowres_wide_intrinsics, scaled",)},
+            write=write_wide, written={"name": name}) for name in ("wide", "color")),
+    arkit("no intrinsics of any size", at(3, 10), [("1/*_intrinsics/*", DELETE)], write=write_wide,
+          written={"name": "wide"}, error="wide_intrinsics: found none, also of no other size"),
+    arkit("the first by name", at(4), (), {"hw": HW}, written=all_vga()),
+    arkit("the largest by name", at(4), (), {"hw": VGA_HW}, written=all_vga(), options={"image": "vga_wide"}),
+    arkit("no such asset", at(4), options={"image": "wide"},
+          error=r"wide: found none, expected <video id>_<seconds>.png"),
+    arkit("no such name", at(4), options={"image": "ultrawide"},
+          error="option image: found ultrawide, expected one of lowres_wide, vga_wide, wide"),
+    arkit("no pose is taken over", at(12), [(TRAJ, without((3, 4, 5)))],
+          {"number": [0, 1, 2, 6, 7, 8, 9, 10, 11], "report": NO_POSES,
+           "same": ([0, 1, 2, 6, 7, 8, 9, 10, 11], 1e-3)}, options={"interpolate": False}),
+    arkit("no gap of 67 ms is bridged", at(12), [(TRAJ, without((3, 4, 5)))],
+          {"number": [0, 1, 2, 6, 7, 8, 9, 10, 11]}, options={"max_pose_gap": 0.05}),
+    arkit("the first and last need a pose", at(6), (), {"number": [2, 3]},
+          written={"trajectory": shots(100 + np.arange(2, 4) / 60)}),
+    arkit("no pose at all", at(6), written={"trajectory": shots([100.06 + 0.04])},
+          error="6 images without a pose: left out, expected images with depth"),
+    arkit("no trajectory", at(4), [(TRAJ, DELETE)],
+          {"posed": False, "number": [0, 1, 2, 3],
+           "report": ("no lowres_wide.traj: frames have no pose and are not rotated",)}, options={"upright": True}),
+    arkit("poses not read", at(4), [(TRAJ, DELETE)], {"posed": False, "report": ()}, options={"poses": False}),
+    arkit("names sorted as numbers", lambda: shots([99.95, 99.9833, 100.0, 100.0167]), (),
+          {"times": [99.95, 99.983, 100.0, 100.017], "same": ([0, 1, 2, 3], 1e-3)}),
+    # the depth before and after is 16 ms away: not its depth
+    arkit("parts missing in the middle", at(8),
+          [("1/lowres_depth/*_100.017.png", DELETE), ("1/confidence/*_100.050.png", DELETE),
+           ("1/lowres_wide_intrinsics/*_100.083.pincam", DELETE), ("1/lowres_wide/*_100.100.png", DELETE)],
+          {"number": [0, 2, 4, 6], "same": ([0, 2, 4, 7], 1e-3), "report": (
+              "1 depth map without a picture: left out", "1 image without depth: left out",
+              "1 image without confidence: left out", "1 image without intrinsics: left out")}),
+    arkit("no confidence", at(4), [("1/confidence/*", DELETE)],
+          {"conf": False, "report": ("no confidence: all returns are weighted equally",)}),
+    arkit("no depth", at(4), [("1/lowres_depth/*", DELETE)],
+          error=r"lowres_depth: found none, expected <video id>_<seconds>.png"),
+    arkit("no gap at all", at(4), options={"max_pose_gap": 0}, error="option max_pose_gap: found 0.0"),
+    *(arkit(f"pincam {text[:20]}", at(4), [("1/lowres_wide_intrinsics/*_100.000.pincam", text)], error=message)
+      for text, message in (
+          ("64 48 61 58 33", r"pincam: line 1: found 5 columns, expected 6 numbers"),
+          ("64 48 nan 58 33 21", r"pincam: intrinsics: found .*nan.*, expected 6 finite numbers"),
+          ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of an image"),
+          ("0 48 61 58 33 21", r"pincam: width and height: found 0 48"),
+          ("1e5 1e5 61 58 33 21", r"pincam: width and height: found 100000 100000"),
+          ("640 480 61 58 33 21", r"lowres_wide.*png: size: found 64x48, expected 640x480"),
+          (PINCAM * 2, r"pincam: intrinsics: found nothing"),
+          ("64 48 -61 58 33 21", r"pincam: intrinsics focal length"))),
+    arkit("levels above 2", at(4), [("1/confidence/*_100.000.png", np.full((*HW, 1), 3, np.uint8))],
+          error=r"confidence: found 1 channels up to 3, expected 1 channel of 0, 1 or 2"),
+    arkit("confidence of three channels", at(4), [("1/confidence/*_100.000.png", np.zeros((*HW, 3), np.uint8))],
+          error=r"confidence: found 3 channels"),
+    arkit("rows that are lost", at(4), [(TRAJ, lambda text: "\n".join(
+        ["100.0 nan 0 0 0 0 0", *text.splitlines()[1:], "100.2 inf 0 0 0 0 0"]))], {"number": [1, 2, 3]}),
+    *(arkit(f"trajectory {text[:20]}", at(4), [(TRAJ, text)], error=message) for text, message in (
+        ("100.0 nan 0 0 0 0 0", r"lowres_wide.traj: poses: found no usable row"),
+        ("100.0 0 0 0 0 0", r"lowres_wide.traj: line 1: found 6 columns, expected 7 numbers"),
+        ("one 0 0 0 0 0 0", r"lowres_wide.traj: line 1: found one"),
+        ("# nothing", r"lowres_wide.traj: poses: found no usable row"))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
 
 
 def test_downloads_complete_each_other(tmp_path: Path) -> None:
@@ -150,25 +221,16 @@ def test_3dod_keeps_its_frames_one_folder_down(tmp_path: Path) -> None:
         assert recording.name == "42445173" and recording.format == "arkitscenes" and len(recording) == 3
 
 
-# ------------------------------------------------------------------------------------------------------ poses and time
-
-
-def test_no_pose_is_ever_taken_over(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    frames = shots(100 + np.arange(12) / 60)
-    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
-    rows = (root / "lowres_wide.traj").read_text().splitlines()
-    (root / "lowres_wide.traj").write_text("\n".join(row for i, row in enumerate(rows) if i not in (3, 4, 5)))
-    own = stored(root, interpolate=False)
-    assert own.number.tolist() == [0, 1, 2, 6, 7, 8, 9, 10, 11]
-    assert own.report == ("3 images without a pose: left out",)
-    check_same(own, [f for i, f in enumerate(frames) if i not in (3, 4, 5)], 1 / 1000)
-    narrow = stored(root, max_pose_gap=0.05)  # the hole is 67 ms wide
-    assert narrow.number.tolist() == own.number.tolist()
-    bridged = stored(root)
+def test_a_gap_is_bridged_by_interpolation_and_one_pose_serves_the_images_near_it(tmp_path: Path) -> None:
+    write(tmp_path, shots(100 + np.arange(12) / 60))
+    edit_files(tmp_path, [(TRAJ, without((3, 4, 5)))])
+    bridged = stored(tmp_path / "1")
     assert len(bridged) == 12
-    true = path(float(bridged.times[4]))
-    torch.testing.assert_close(bridged.poses.t[4:5], true.t, atol=1e-9, rtol=0)
+    torch.testing.assert_close(bridged.poses.t[4:5], path(float(bridged.times[4])).t, atol=1e-9, rtol=0)
+    writers.write_arkitscenes(tmp_path / "1", {}, trajectory=shots([100 + 2 / 60 - 0.004]))  # 4 ms off
+    recording = stored(tmp_path / "1")
+    assert recording.number.tolist() == [2] and recording.rate_hz is None
+    torch.testing.assert_close(recording.poses.t, path(100 + 2 / 60 - 0.004).t, atol=1e-5, rtol=0)
 
 
 def test_names_a_millisecond_apart_are_one_instant(tmp_path: Path) -> None:
@@ -189,75 +251,17 @@ def test_names_a_millisecond_apart_are_one_instant(tmp_path: Path) -> None:
     assert recording.number.tolist() == [0, 2, 3] and recording.report == ("1 image without intrinsics: left out",)
 
 
-def test_first_and_last_images_need_a_pose_too(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    frames = shots(100 + np.arange(6) / 60)
-    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames[2:4])
-    assert stored(root).number.tolist() == [2, 3]
-    writers.write_arkitscenes(root, {}, trajectory=shots([100 + 2 / 60 - 0.004]))  # one pose, 4 ms off
-    recording = stored(root)
-    assert recording.number.tolist() == [2] and recording.rate_hz is None
-    torch.testing.assert_close(recording.poses.t, path(100 + 2 / 60 - 0.004).t, atol=1e-5, rtol=0)
-    writers.write_arkitscenes(root, {}, trajectory=shots([100.06]))
-    with pytest.raises(FormatError, match="6 images without a pose: left out, expected images with depth"):
-        stored(root)
-
-
-def test_captures_without_trajectory_keep_their_frames(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    capture(root)
-    (root / "lowres_wide.traj").unlink()
-    recording = data.open(root)
-    assert len(recording) == 4 and recording.poses is None and recording[0].T_world_from_cam is None
-    assert recording.report == ("no lowres_wide.traj: frames have no pose and are not rotated",)
-    assert data.open(root, poses=False).report == ()
-
-
-def test_names_are_sorted_as_numbers(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    frames = shots([99.95, 99.9833, 100.0, 100.0167])
-    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames[::-1])
-    recording = stored(root)
-    assert recording.times.tolist() == [99.95, 99.983, 100.0, 100.017]
-    check_same(recording, frames, 1 / 1000)
-
-
-def test_a_frame_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    frames = capture(root, n=8)
-    drop(root, "lowres_depth", "100.017")  # the depth before and after is 16 ms away: not its depth
-    drop(root, "confidence", "100.050")
-    drop(root, "lowres_wide_intrinsics", "100.083")
-    drop(root, "lowres_wide", "100.100")
-    recording = stored(root)
-    assert recording.number.tolist() == [0, 2, 4, 6]  # of seven images
-    assert recording.report == (
-        "1 depth map without a picture: left out",
-        "1 image without depth: left out",
-        "1 image without confidence: left out",
-        "1 image without intrinsics: left out",
-    )
-    check_same(recording, [frames[i] for i in (0, 2, 4, 7)], 1 / 1000)
-
-
 def test_confidence_is_that_of_the_depth_map(tmp_path: Path) -> None:
     root = tmp_path / "1"
     image = shots([100.0], VGA, VGA_HW)
     depths = shots([99.991, 100.007])
     writers.write_arkitscenes(root, {"vga_wide": image, "lowres_depth": depths}, trajectory=image)
     assert torch.equal(stored(root)[0].conf, depths[1].conf)
-    drop(root, "confidence", "100.007")  # the other one is near the image too, but belongs to another depth map
+    edit_files(
+        root, [("confidence/*_100.007.png", DELETE)]
+    )  # the other one is near the image too, but belongs to another depth map
     with pytest.raises(FormatError, match="1 image without confidence: left out"):
         stored(root)
-
-
-def test_no_confidence_at_all(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    capture(root)
-    for file in (root / "confidence").iterdir():
-        file.unlink()
-    recording = stored(root)
-    assert recording[0].conf is None and recording.report == ("no confidence: all returns are weighted equally",)
 
 
 def test_nearest_against_brute_force() -> None:
@@ -284,9 +288,6 @@ def test_rotation_vectors_and_the_way_between_rotations() -> None:
             part, whole = (2 * math.acos(min(abs(float((a * x).sum())), 1)) for x in (q, b))
             assert part == pytest.approx(0.3 * whole, abs=1e-7)
         np.testing.assert_allclose(convert.slerp(a, a, np.array([0.7])), a, atol=1e-15)
-
-
-# -------------------------------------------------------------------------------------------------------- orientation
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
@@ -347,9 +348,6 @@ def test_turning_a_lens_keeps_every_ray() -> None:
         assert convert.rot90_image(picture, turns)[5, 7] == (
             picture[HW[0] - 1 - 7, 5] if turns == 1 else picture[HW[0] - 1 - 5, HW[1] - 1 - 7]
         )
-
-
-# -------------------------------------------------------------------------------------------------------- laser truth
 
 
 def test_laser_depth_is_taken_to_the_images_pixels(tmp_path: Path) -> None:
@@ -413,9 +411,6 @@ def test_laser_truth_enters_the_main_job(tmp_path: Path) -> None:
     assert found.ok.all() and float((found.depth - 1.8).abs().max()) < 0.1
 
 
-# --------------------------------------------------------------------------------------------------- lazy, and damaged
-
-
 def test_opening_decodes_nothing_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture(tmp_path / "1", highres_depth=shots([100.0], VGA, VGA_HW))
     decoded = []
@@ -426,56 +421,6 @@ def test_opening_decodes_nothing_and_recordings_travel(tmp_path: Path, monkeypat
     twin = pickle.loads(pickle.dumps(recording))
     assert torch.equal(twin[2].depth, recording[2].depth) and len(decoded) == 6
     assert torch.equal(twin.truth(0)["depth"], recording.truth(0)["depth"])
-
-
-def fails(message: str, root: Path, **options: object) -> None:
-    with pytest.raises(FormatError, match=message) as caught:
-        list(data.open(root, "arkitscenes", **options))
-    assert "\n" not in str(caught.value)
-
-
-def test_bad_files(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    capture(root)
-    pincam = next(iter(sorted((root / "lowres_wide_intrinsics").iterdir())))
-    good = pincam.read_text()
-    for text, message in (
-        ("64 48 61 58 33", r"pincam: line 1: found 5 columns, expected 6 numbers"),
-        ("64 48 nan 58 33 21", r"pincam: intrinsics: found .*nan.*, expected 6 finite numbers"),
-        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of an image"),
-        ("0 48 61 58 33 21", r"pincam: width and height: found 0 48"),
-        ("1e5 1e5 61 58 33 21", r"pincam: width and height: found 100000 100000"),
-        ("640 480 61 58 33 21", r"lowres_wide.*png: size: found 64x48, expected 640x480"),
-        (good + good, r"pincam: intrinsics: found nothing"),
-        ("64 48 -61 58 33 21", r"pincam: intrinsics focal length"),
-    ):
-        pincam.write_text(text)
-        fails(message, root)
-    pincam.write_text(good)
-    conf = next(iter(sorted((root / "confidence").iterdir())))
-    image = next(iter(sorted((root / "lowres_wide").iterdir())))
-    good_conf = conf.read_bytes()
-    conf.write_bytes(parts.encode_unfiltered_png(np.full(HW, 3, np.uint8)[..., None]))
-    fails(r"confidence: found 1 channels up to 3, expected 1 channel of 0, 1 or 2", root)
-    conf.write_bytes(image.read_bytes())
-    fails(r"confidence: found 3 channels", root)
-    conf.write_bytes(good_conf)
-    traj = root / "lowres_wide.traj"
-    rows = traj.read_text().splitlines()
-    traj.write_text("\n".join(["100.0 nan 0 0 0 0 0", *rows[1:], "100.2 inf 0 0 0 0 0"]))
-    assert stored(root).number.tolist() == [1, 2, 3]
-    for text, message in (
-        ("100.0 nan 0 0 0 0 0", r"lowres_wide.traj: poses: found no usable row"),
-        ("100.0 0 0 0 0 0", r"lowres_wide.traj: line 1: found 6 columns, expected 7 numbers"),
-        ("\n".join(rows).replace("100", "one", 1), r"lowres_wide.traj: line 1: found one"),
-        ("# nothing", r"lowres_wide.traj: poses: found no usable row"),
-    ):
-        traj.write_text(text)
-        fails(message, root)
-    fails("option max_pose_gap: found 0.0", root, max_pose_gap=0)
-    for file in (root / "lowres_depth").iterdir():
-        file.unlink()
-    fails(r"lowres_depth: found none, expected <video id>_<seconds>.png", root)
 
 
 def test_other_folders_are_not_taken_for_captures(tmp_path: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
-import shutil
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,7 +15,9 @@ import pytest
 import torch
 from support import writers
 from support.box_scene import disagreement, off_wall, own_camera, pose, turned_over, world_points
-from support.stray_frames import DEPTH_HW, HW, camera_of, walk
+from support.capture_cases import DELETE, Case, check_case, check_frames
+from support.stray_frames import HW, camera_of, walk
+from support.writers import parts
 
 from dhtorch import data, pytree
 from dhtorch.data.clocks import FilmPairing
@@ -32,22 +35,6 @@ ROOT = os.environ.get("DHTORCH_DATA")
 STEP = 1e-3  # m, of the depth codes
 
 
-def same_scene(recording: data.Recording, frames: list[Frame], image: float = 12) -> None:
-    assert len(recording) == len(frames)
-    for got, want in zip(recording, frames, strict=True):
-        torch.testing.assert_close(got.camera.f, want.camera.f)
-        torch.testing.assert_close(got.camera.c, want.camera.c)
-        torch.testing.assert_close(got.depth, want.depth, atol=STEP / 2 + 1e-6, rtol=0)
-        assert torch.equal(got.conf, want.conf)
-        torch.testing.assert_close(got.time, want.time, atol=1e-8, rtol=0)
-        T = turn_world(want, ARKIT_UP).T_world_from_cam
-        torch.testing.assert_close(got.T_world_from_cam.R, T.R, atol=1e-12, rtol=0)
-        torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
-        assert float(off_wall(world_points(own_camera(got))).max()) < 2 * STEP
-        assert picture_error(got, want) < image
-    assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
-
-
 def picture_error(a: Frame, b: Frame) -> float:
     return float((a.image.float() - b.image.float()).abs().mean())
 
@@ -55,9 +42,6 @@ def picture_error(a: Frame, b: Frame) -> float:
 def steady(i: int) -> Pose:
     """Pose ``i`` of a motion so fast that the picture before or after is clearly another."""
     return se3.exp(torch.tensor([[0.0, 0.12 * i, 0.05 * i, 0.05 * i, 0.0, 0.0]]).double())
-
-
-# ------------------------------------------------------------------------------------------------ written, then read
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])
@@ -69,68 +53,12 @@ def test_capture_gives_back_the_scene(tmp_path: Path, codec: str, depth_format: 
     recording = data.open(tmp_path)
     assert recording.report == () and recording.number.tolist() == [0, 1, 2, 3]
     assert recording.rate_hz == pytest.approx(60, rel=1e-4)
-    same_scene(recording, frames)
+    check_frames(recording, frames, STEP, up=ARKIT_UP)
+    assert recording.times.tolist() == pytest.approx([float(f.time[0]) for f in frames], abs=1e-8)
+    assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
     copy = pickle.loads(pickle.dumps(recording))
     assert all(torch.equal(a.image, b.image) for a, b in zip(copy, recording, strict=True))
     assert pytree.collate(list(recording)).image.shape == (4, 3, *HW)
-
-
-def test_frames_may_start_anywhere(tmp_path: Path) -> None:
-    frames = walk()
-    writers.write_stray(tmp_path, frames, per_frame=True, start=998)
-    recording = data.open(tmp_path)
-    assert recording.number.tolist() == [998, 999, 1000, 1001]
-    same_scene(recording, frames)
-
-
-def test_frames_dropped_by_the_app_keep_their_times(tmp_path: Path) -> None:
-    """15 frames a second by leaving three of four out: pictures count on, the clock does not follow from them."""
-    frames = [f.replace(time=f.time + 3 * i / 60) for i, f in enumerate(walk())]
-    frames[3] = frames[3].replace(time=frames[3].time + 1)  # and a pause
-    writers.write_stray(tmp_path, frames, per_frame=True)
-    (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\nno, number\n")
-    recording = data.open(tmp_path)
-    assert recording.rate_hz == pytest.approx(15, rel=1e-4) and recording.report == ()
-    same_scene(recording, frames)
-
-
-def test_old_odometry_has_the_K_of_the_last_frame(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, walk())
-    assert "fx" not in (tmp_path / "odometry.csv").read_text()
-    assert all(torch.equal(f.camera.f, camera_of(3).f) for f in data.open(tmp_path))
-
-
-def test_new_odometry_has_K_in_every_row_and_empty_cells(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, walk(), per_frame=True)
-    lines = (tmp_path / "odometry.csv").read_text().splitlines()
-    assert lines[0].endswith("cy, distortion_center_x, distortion_center_y") and lines[1].endswith(", , ")
-    assert [float(f.camera.f[0, 0]) for f in data.open(tmp_path)] == [80, 81, 82, 83]
-    assert [float(f.camera.f[0, 0]) for f in data.open(tmp_path, per_frame=False)] == [83] * 4
-    cells = lines[2].split(",")
-    cells[9:13] = [" "] * 4  # a row without
-    (tmp_path / "odometry.csv").write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]))
-    assert [float(f.camera.f[0, 0]) for f in data.open(tmp_path)] == [80, 83, 82, 83]
-
-
-def test_K_of_another_size(tmp_path: Path) -> None:
-    """A capture whose video was made smaller keeps its K: an option gives the size of K."""
-    frames = walk(2)
-    writers.write_stray(tmp_path, [f.replace(camera=cameras.resize(f.camera, HW, (1440, 1920))) for f in frames])
-    camera = data.open(tmp_path, K_hw=(1440, 1920))[0].camera
-    torch.testing.assert_close(camera.f, camera_of(1).f)
-    torch.testing.assert_close(camera.c, camera_of(1).c)
-
-
-def test_confidence_of_three_channels(tmp_path: Path) -> None:
-    frames = walk(2)
-    writers.write_stray(tmp_path, frames, per_frame=True, confidence_channels=3)
-    same_scene(data.open(tmp_path), frames)
-
-
-def test_capture_without_confidence(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, [f.replace(conf=None) for f in walk(2)])
-    recording = data.open(tmp_path)
-    assert recording.report == () and recording[0].conf is None
 
 
 def test_random_access_and_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,9 +72,6 @@ def test_random_access_and_opening_decodes_nothing(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(codec_video._Decoder, "frame", lambda *_: pytest.fail("decoded a picture"))
     codec_video.close_videos()
     assert len(data.open(tmp_path)) == 30
-
-
-# --------------------------------------------------------------------------------------------- the first picture lost
 
 
 def test_first_picture_before_time_zero(tmp_path: Path) -> None:
@@ -196,32 +121,6 @@ def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame
     assert data.open(tmp_path / "long", lost_first=True).number.tolist() == list(range(1, 9))
 
 
-def test_a_longer_film_is_paired_from_the_first_picture_on(tmp_path: Path) -> None:
-    frames = walk(6)
-    writers.write_stray(tmp_path / "rows", frames[:4], per_frame=True)
-    writers.write_stray(tmp_path / "film", frames, per_frame=True)
-    (tmp_path / "film" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
-    recording = data.open(tmp_path / "rows")
-    assert recording.report == ("rgb.mp4 has 6 frames for 4 rows: paired from the first on",)
-    same_scene(recording, frames[:4])
-
-
-def test_a_shorter_film_of_constant_rate_is_refused_unless_an_option_decides(tmp_path: Path) -> None:
-    frames = walk(6)
-    writers.write_stray(tmp_path, frames, per_frame=True, pictures=[0, 1, 2], film_times=[0, 1 / 60, 2 / 60])
-    expected = r"rgb.mp4: frames: found 3 pictures less than rows at a constant rate.*data.lost_first=true"
-    with pytest.raises(FormatError, match=expected):
-        data.open(tmp_path)
-    recording = data.open(tmp_path, lost_first=False)
-    assert recording.report[0] == "rgb.mp4 has 3 frames for 6 rows: its last frames are lost (option lost_first)"
-    assert recording.report[1] == "rows 3, 4, 5 have no picture in rgb.mp4: left out"
-    same_scene(recording, frames[:3])
-    assert data.open(tmp_path, lost_first=True).number.tolist() == [3, 4, 5]
-
-
-# --------------------------------------------------------------------------------------------- pictures by their stamps
-
-
 def same_pictures(recording: data.Recording, frames: list[Frame], numbers: list[int]) -> None:
     """The frames with these numbers, each with its own picture, depth and pose."""
     assert recording.number.tolist() == numbers
@@ -235,48 +134,30 @@ def same_pictures(recording: data.Recording, frames: list[Frame], numbers: list[
 
 LOST = [4, 5, 6]
 KEPT = [i for i in range(12) if i not in LOST]
+NO_ROWS = ["^rgb.mp4 has 9 frames for 12 rows: paired by their time stamps", "^rows 4, 5, 6 have no picture in rgb.mp4"]
 
 
-@pytest.mark.parametrize("rate", [60.0, 30.0, 24.0])
-def test_rows_of_lost_pictures_are_left_out_and_named(tmp_path: Path, rate: float) -> None:
-    """Whatever nominal rate a writer gave the film; the rows are at 60 Hz."""
-    frames = walk(12, steady)
-    writers.write_stray(tmp_path, frames, pictures=KEPT, film_times=[i / rate for i in KEPT])
-    recording = data.open(tmp_path)
-    same_pictures(recording, frames, KEPT)
-    assert recording.report[0].startswith("rgb.mp4 has 9 frames for 12 rows: paired by their time stamps")
-    assert ("it plays" in recording.report[0]) == (rate != 60)
-    assert recording.report[1] == "rows 4, 5, 6 have no picture in rgb.mp4: left out"
-
-
-@pytest.mark.parametrize("every", [2, 3])
-def test_a_film_of_a_fraction_of_the_rate(tmp_path: Path, every: int) -> None:
-    frames = walk(12, steady)
-    kept = list(range(0, 12, every))
-    writers.write_stray(tmp_path, frames, pictures=kept)
+@pytest.mark.parametrize(
+    ("n", "kept", "stamps", "report"),
+    [
+        # whatever nominal rate a writer gave the film; the rows are at 60 Hz
+        *((12, KEPT, [i / rate for i in KEPT], NO_ROWS) for rate in (60.0, 30.0, 24.0)),
+        *((12, list(range(0, 12, every)), None, ["", "have no picture in rgb.mp4: left out"]) for every in (2, 3)),
+        (8, list(range(8)), [i / 30 for i in range(8)], []),
+        (8, list(range(8)), [i / 60 + 0.006 * (-1) ** i for i in range(8)], []),
+        (12, [*range(5), *range(6, 12)], [i / 60 + 0.002 * (-1) ** i for i in range(12) if i != 5], ["", ""]),
+    ],
+)
+def test_pictures_are_paired_by_their_stamps(
+    tmp_path: Path, n: int, kept: list[int], stamps: list[float] | None, report: list[str]
+) -> None:
+    frames = walk(n, steady)
+    writers.write_stray(tmp_path, frames, pictures=kept, film_times=stamps)
     recording = data.open(tmp_path)
     same_pictures(recording, frames, kept)
-    assert "have no picture in rgb.mp4: left out" in recording.report[1]
-
-
-def test_a_film_of_another_nominal_rate_or_a_variable_one_keeps_its_rows(tmp_path: Path) -> None:
-    frames = walk(8, steady)
-    jitter = [i / 60 + 0.006 * (-1) ** i for i in range(8)]
-    for name, stamps in (("nominal", [i / 30 for i in range(8)]), ("variable", jitter)):
-        writers.write_stray(tmp_path / name, frames, film_times=stamps)
-        recording = data.open(tmp_path / name)
-        assert recording.report == ()
-        same_pictures(recording, frames, list(range(8)))
-
-
-def test_stamps_that_jitter_do_not_hide_a_lost_picture(tmp_path: Path) -> None:
-    frames = walk(12, steady)
-    kept = [i for i in range(12) if i != 5]
-    writers.write_stray(tmp_path, frames, pictures=kept, film_times=[i / 60 + 0.002 * (-1) ** i for i in kept])
-    same_pictures(data.open(tmp_path), frames, kept)
-
-
-# ---------------------------------------------------------------------------------------------------------- orientation
+    assert len(recording.report) == len(report) and all(map(re.search, report, recording.report))
+    if report is NO_ROWS:
+        assert ("it plays" in recording.report[0]) == (stamps != [i / 60 for i in KEPT])
 
 
 def test_display_matrix_with_lying_depth_changes_nothing(tmp_path: Path, room: list[Frame]) -> None:
@@ -315,32 +196,115 @@ def test_a_film_turned_upright_is_turned_back(tmp_path: Path, room: list[Frame],
         torch.testing.assert_close(got.camera.c, want.camera.c)
 
 
-# ------------------------------------------------------------------------------------------------- damage and absence
+def npy(array: np.ndarray) -> bytes:
+    """An array as a file."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
 
 
-def test_missing_parts_keep_the_rest_in_step(tmp_path: Path) -> None:
-    frames = walk(8)
-    writers.write_stray(tmp_path, frames, per_frame=True)
-    (tmp_path / "depth" / "000002.png").unlink()
-    (tmp_path / "confidence" / "000003.png").unlink()
-    shutil.copy(tmp_path / "depth" / "000000.png", tmp_path / "depth" / "000099.png")
-    lines = (tmp_path / "odometry.csv").read_text().splitlines()
-    for row, cell in ((5, "nan"), (6, "0")):
-        cells = lines[1 + row].split(",")
-        cells[5:9] = [cell] * 4
-        lines[1 + row] = ",".join(cells)
-    (tmp_path / "odometry.csv").write_text("\n".join(lines))
-    recording = data.open(tmp_path)
-    assert recording.number.tolist() == [0, 1, 4, 7]
-    assert recording.report == (
-        "frame 2: no depth: left out",
-        "frame 3: no confidence: left out",
-        "2 frames (5, 6): its pose is not usable (tracking lost): left out",
-        "frame 000099: no row in odometry.csv: left out",
-    )
-    same_scene(recording, [frames[i] for i in (0, 1, 4, 7)])
-    without = data.open(tmp_path, poses=False)
-    assert without.poses is None and without.number.tolist() == [0, 1, 4, 5, 6, 7]
+def lagging() -> list[Frame]:
+    """15 frames a second by leaving three of four out, and a pause: the clock does not follow from the numbers."""
+    frames = [f.replace(time=f.time + 3 * i / 60) for i, f in enumerate(walk())]
+    return [*frames[:3], frames[3].replace(time=frames[3].time + 1)]
+
+
+def cells(row: int, first: int, last: int, text: str) -> tuple[str, Any]:
+    """An edit of cells of a row of the odometry."""
+
+    def change(table: str) -> str:
+        lines = table.splitlines()
+        words = lines[1 + row].split(",")
+        words[first:last] = [text] * (last - first)
+        return "\n".join([*lines[: 1 + row], ",".join(words), *lines[2 + row :]])
+
+    return ROWS, change
+
+
+def cut(table: str) -> str:
+    lines = table.splitlines()
+    return "\n".join([*lines[:-1], lines[-1][:40]])
+
+
+ROWS = "odometry.csv"
+EACH = {"per_frame": True}
+SHORT = EACH | {"pictures": [0, 1, 2], "film_times": [0, 1 / 60, 2 / 60]}
+IMU = ("imu.csv", "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\nno, number\n")
+
+
+def large() -> list[Frame]:
+    """Frames with K of the size before the video was made smaller."""
+    return [f.replace(camera=cameras.resize(f.camera, HW, (1440, 1920))) for f in walk(2)]
+
+
+def stray_case(name: str, frames: Any, edits: Any = (), expect: Any = None, **more: Any) -> Case:
+    return Case(name, writers.write_stray, frames, edits, expect or {}, up=ARKIT_UP, **more)
+
+
+ALL = {"same": ([0, 1, 2, 3], STEP), "report": ()}
+CASES = [
+    stray_case("starts anywhere", walk, (), ALL | {"number": [998, 999, 1000, 1001]}, written=EACH | {"start": 998}),
+    stray_case("frames dropped by the app", lagging, [IMU], ALL | {"rate": pytest.approx(15, rel=1e-4)}, written=EACH),
+    stray_case("K of the last frame", walk, (), {"all f": [83] * 4, "report": ()}),
+    stray_case("K in every row", walk, (), {"all f": [80, 81, 82, 83]}, written=EACH),
+    stray_case("K of the file", walk, (), {"all f": [83] * 4}, written=EACH, options={"per_frame": False}),
+    stray_case("a row without K", walk, [cells(1, 9, 13, " ")], {"all f": [80, 83, 82, 83]}, written=EACH),
+    stray_case("K of another size", large, (), {"f": camera_of(1).f[0].tolist(), "c": pytest.approx(
+        camera_of(1).c[0].tolist(), abs=1e-4)}, options={"K_hw": (1440, 1920)}),
+    stray_case("confidence of three channels", lambda: walk(2), (), {"same": ([0, 1], STEP), "conf": True},
+               written=EACH | {"confidence_channels": 3}),
+    stray_case("no confidence", lambda: [f.replace(conf=None) for f in walk(2)], (), {"conf": False, "report": ()}),
+    stray_case("a longer film", lambda: walk(6), [("odometry.csv", lambda text: "\n".join(text.splitlines()[:5])),
+                                                  ("depth/00000[45].png", DELETE), ("confidence/00000[45].png", DELETE)],
+               {"report": ("rgb.mp4 has 6 frames for 4 rows: paired from the first on",), "same": ([0, 1, 2, 3], STEP)},
+               written=EACH),
+    stray_case("a shorter film of constant rate", lambda: walk(6), written=SHORT,
+               error=r"rgb.mp4: frames: found 3 pictures less than rows at a constant rate.*data.lost_first=true"),
+    stray_case("its last pictures lost", lambda: walk(6), (), {"same": ([0, 1, 2], STEP), "report": (
+        "rgb.mp4 has 3 frames for 6 rows: its last frames are lost (option lost_first)",
+        "rows 3, 4, 5 have no picture in rgb.mp4: left out")}, written=SHORT, options={"lost_first": False}),
+    stray_case("its first pictures lost", lambda: walk(6), (), {"number": [3, 4, 5]}, written=SHORT,
+               options={"lost_first": True}),
+    stray_case("missing parts", lambda: walk(8),
+               [("depth/000002.png", DELETE), ("confidence/000003.png", DELETE), ("depth/000099.png", b""),
+                cells(5, 5, 9, "nan"), cells(6, 5, 9, "0")],
+               {"number": [0, 1, 4, 7], "same": ([0, 1, 4, 7], STEP), "report": (
+                   "frame 2: no depth: left out", "frame 3: no confidence: left out",
+                   "2 frames (5, 6): its pose is not usable (tracking lost): left out",
+                   "frame 000099: no row in odometry.csv: left out")}, written=EACH),
+    stray_case("missing poses, none read", lambda: walk(8), [cells(5, 5, 9, "nan")],
+               {"number": list(range(8)), "posed": False}, written=EACH, options={"poses": False}),
+    stray_case("tables of the lens", lambda: walk(2), [("distortion/0.bin", b"")],
+               {"report": ["^distortion/ has lens tables of each frame: they are not applied"]}),
+    stray_case("a row that is cut off", walk, [(ROWS, cut)],
+               {"number": [0, 1, 2], "report": ["^the last row of odometry.csv is cut off: left out", "frame 000003: no row", "last frame is lost"]},
+               options={"lost_first": False}),
+    stray_case("stamps out of order", walk, [cells(2, 0, 1, "1.5")],
+               {"times": None, "report": ("time stamps do not increase: there are no times",)}),
+    *(stray_case(f"odometry {old} {new}", walk, [(ROWS, lambda text, old=old, new=new: text.replace(old, new, 1))],
+                 error=message) for old, new, message in (
+        ("timestamp, frame, x", "time, frame, x", r"odometry.csv: header: found time, frame, x.*, expected timestamp"),
+        (", 000001,", ", 1e3,", r"odometry.csv: row 1 frame: found 1e3, expected a frame number"),
+        (", 000002,", ", 000001,", r"odometry.csv: row 2 frame: found 1, expected a number beyond 1"),
+        (", 000001,", ",", r"odometry.csv: row 1: found 8 columns, expected 9, as the header"),
+        ("258528.330141458", "inf", r"odometry.csv: row 0 timestamp: found inf, expected a time in s"),
+        (", 000001, ", ", 000001, x", r"odometry.csv: row 1 x: found x.*, expected a number"),
+        (", 000001, ", ", 000001, 1e9", r"odometry.csv: pose \d.*: found|row 1 x"))),
+    *(stray_case(f"{name} {message}", walk, edits, error=message) for name, edits, message in (
+        ("K of two rows", [("camera_matrix.csv", "1,2,3\n4,5,6")], "camera_matrix.csv: K: found"),
+        ("K with skew", [("camera_matrix.csv", [("1.0", "2.0")])],
+         r"camera_matrix.csv: intrinsics of frame 0: found .*no skew"),
+        ("a short map", [("depth/000000.png", parts.encode_unfiltered_png(np.ones((24, 32), np.uint16))[:-30])],
+         r"000000.png: data: found a truncated"),
+        ("floats", [("depth/000001.png", DELETE), ("depth/000001.npy", npy(np.zeros((3, 4))))],
+         r"000001.npy: depth: found float64 of shape"),
+        ("no film", [("rgb.mp4", b"no video")], r"rgb.mp4: content"))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
 
 
 def test_no_video(tmp_path: Path) -> None:
@@ -355,77 +319,6 @@ def test_no_video(tmp_path: Path) -> None:
         assert torch.equal(got.camera.f, want.camera.f)
         assert float(off_wall(world_points(got)).max()) < 2 * STEP  # by the depth map's own camera
     assert disagreement(recording[0], recording[1])[0] < 0.04
-
-
-def test_distortion_tables_are_reported(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, walk(2))
-    (tmp_path / "distortion").mkdir()
-    assert data.open(tmp_path).report == ("distortion/ has lens tables of each frame: they are not applied",)
-
-
-def test_cut_off_last_row_and_stamps_out_of_order(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, walk())
-    table = tmp_path / "odometry.csv"
-    lines = table.read_text().splitlines()
-    table.write_text("\n".join([*lines[:-1], lines[-1][:40]]))
-    recording = data.open(tmp_path, lost_first=False)
-    assert recording.number.tolist() == [0, 1, 2]
-    assert recording.report[0] == "the last row of odometry.csv is cut off: left out"
-    early = "1.5" + lines[3][lines[3].index(",") :]
-    table.write_text("\n".join([*lines[:3], early, *lines[4:]]))
-    recording = data.open(tmp_path)
-    assert recording.times is None and recording.report == ("time stamps do not increase: there are no times",)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("timestamp, frame, x", "time, frame, x", r"odometry.csv: header: found time, frame, x.*, expected timestamp"),
-        (", 000001,", ", 1e3,", r"odometry.csv: row 1 frame: found 1e3, expected a frame number"),
-        (", 000002,", ", 000001,", r"odometry.csv: row 2 frame: found 1, expected a number beyond 1"),
-        (", 000001,", ",", r"odometry.csv: row 1: found 8 columns, expected 9, as the header"),
-        ("258528.330141458", "inf", r"odometry.csv: row 0 timestamp: found inf, expected a time in s"),
-        (", 000001, ", ", 000001, x", r"odometry.csv: row 1 x: found x.*, expected a number"),
-        (", 000001, ", ", 000001, 1e9", r"odometry.csv: pose \d.*: found|row 1 x"),
-    ],
-)
-def test_unsound_odometry(tmp_path: Path, old: str, new: str, message: str) -> None:
-    writers.write_stray(tmp_path, walk())
-    table = tmp_path / "odometry.csv"
-    text = table.read_text()
-    assert old in text
-    table.write_text(text.replace(old, new, 1))
-    with pytest.raises(FormatError, match=message):
-        data.open(tmp_path)
-
-
-def test_unsound_files(tmp_path: Path) -> None:
-    writers.write_stray(tmp_path, walk())
-    good = (tmp_path / "camera_matrix.csv").read_text()
-    for text, message in (
-        ("1,2,3\n4,5,6", "camera_matrix.csv: K: found"),
-        (good.replace("1.0", "2.0"), r"camera_matrix.csv: intrinsics of frame 0: found .*no skew"),
-    ):
-        (tmp_path / "camera_matrix.csv").write_text(text)
-        with pytest.raises(FormatError, match=message):
-            data.open(tmp_path)[0]
-    (tmp_path / "camera_matrix.csv").write_text(good)
-    depth = tmp_path / "depth" / "000000.png"
-    depth.write_bytes(depth.read_bytes()[:-30])
-    recording = data.open(tmp_path)
-    with pytest.raises(FormatError, match=r"000000.png: data: found a truncated"):
-        recording[0]
-    assert recording[1].depth.shape == (1, *DEPTH_HW)
-    np.save(tmp_path / "depth" / "000001.npy", np.zeros((3, 4)))
-    (tmp_path / "depth" / "000001.png").unlink()
-    with pytest.raises(FormatError, match=r"000001.npy: depth: found float64 of shape"):
-        data.open(tmp_path)[1]
-    (tmp_path / "rgb.mp4").write_bytes(b"no video")
-    with pytest.raises(FormatError, match=r"rgb.mp4: content"):
-        data.open(tmp_path)
-
-
-# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data

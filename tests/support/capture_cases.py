@@ -17,7 +17,7 @@ import torch
 from dhtorch import data
 from dhtorch.data.recording import Recording
 from dhtorch.records import Frame
-from support.box_scene import off_wall, turned_back, walk, world_points
+from support.box_scene import off_wall, own_camera, turned_back, walk, world_points
 from support.writers import parts
 
 DELETE = object()  # in place of a file or of an entry of a JSON document
@@ -82,6 +82,7 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)
     written: Mapping[str, Any] = field(default_factory=dict)
     path: str = "."  # what is opened, below the folder
+    up: Sequence[float] = (0.0, -1.0, 0.0)  # upwards in the written world
 
 
 #: Facts of a recording by name.
@@ -102,6 +103,11 @@ FACTS: Mapping[str, Callable[[Recording], Any]] = {
     "depth f": lambda r: None if r[0].depth_camera is None else r[0].depth_camera.f[0].tolist(),
     "depth hw": lambda r: tuple(r[0].depth.shape[1:]),
     "median": lambda r: float(torch.cat([f.depth[f.depth > 0] for f in r]).median()),
+    "all f": lambda r: [float(f.camera.f[0, 0]) for f in r],
+    "times of": lambda r: [round(float(t), 6) for t in r.times],
+    "conf": lambda r: r[0].conf is not None,
+    "truth": lambda r: hasattr(r, "truth"),
+    "hw": lambda r: r[0].hw,
     "empty": lambda r: [not f.depth.any() for f in r],
 }
 
@@ -129,7 +135,7 @@ def check_case(case: Case, tmp_path: Path) -> None:
         recording = data.open(root / case.path, **case.options)
     for fact, want in case.expect.items():
         if fact == "same":
-            check_frames(recording, [frames[i] for i in want[0]], *want[1:])
+            check_frames(recording, [frames[i] for i in want[0]], *want[1:], up=case.up)
             continue
         got = FACTS[fact](recording)
         if isinstance(want, list) and fact == "report":
@@ -157,8 +163,13 @@ def check_frames(
         for name in ("f", "c"):
             wanted = getattr(want.camera, name)
             torch.testing.assert_close(getattr(got.camera, name), wanted, atol=0 if exact else 1e-5, rtol=0)
+        if got.conf is not None and want.conf is not None:
+            assert torch.equal(got.conf, want.conf)
+        if got.depth_camera is not None and want.depth_camera is not None:
+            torch.testing.assert_close(got.depth_camera.f, want.depth_camera.f)
         if got.T_world_from_cam is not None:
             torch.testing.assert_close(got.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
             torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
             if factor == 1:
-                assert float(off_wall(world_points(got)).max()) < 2 * step + 1e-4
+                shot = got if got.depth.shape[-2:] == got.hw or got.depth_camera is not None else own_camera(got)
+                assert float(off_wall(world_points(shot)).max()) < 2 * step + 1e-4
