@@ -288,7 +288,16 @@ def splat_depth(
     far = torch.full((h * w + 1,), torch.inf)
     depth = far.scatter_reduce(0, index, z.to(far.dtype), "amin")[:-1].view(h, w)
     if hide_px > 0:
-        depth = torch.where(depth > 1.1 * _window_min(depth, hide_px), torch.inf, depth)
+        # Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis
+        minimum = torch.nn.functional.pad(depth, (hide_px,) * 4, value=torch.inf)
+        for dim in (0, 1):
+            width = 1
+            while width < 2 * hide_px + 1:
+                step = min(width, 2 * hide_px + 1 - width)
+                count = minimum.shape[dim] - step
+                minimum = torch.minimum(minimum.narrow(dim, 0, count), minimum.narrow(dim, step, count))
+                width += step
+        depth = torch.where(depth > 1.1 * minimum, torch.inf, depth)
     return torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))
 
 
@@ -319,19 +328,6 @@ def size_of_registered_depth(depth_camera: Camera, camera: Camera, hw: tuple[int
     """
     scale = min(1.0, float((depth_camera.f / camera.f).min()))
     return max(1, round(hw[0] * scale)), max(1, round(hw[1] * scale))
-
-
-def _window_min(depth: Tensor, reach: int) -> Tensor:
-    """Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis."""
-    minimum = torch.nn.functional.pad(depth, (reach,) * 4, value=torch.inf)
-    for dim in (0, 1):
-        width = 1
-        while width < 2 * reach + 1:
-            step = min(width, 2 * reach + 1 - width)
-            count = minimum.shape[dim] - step
-            minimum = torch.minimum(minimum.narrow(dim, 0, count), minimum.narrow(dim, step, count))
-            width += step
-    return minimum
 
 
 def _parse_distortion(value: object, file: Path) -> np.ndarray | None:

@@ -72,18 +72,14 @@ class Corrections:
         if self.pose_convention is not None and recording.poses is not None:
             convention = parse_pose_convention(self.pose_convention)
             recording = replace(recording, poses=convention.apply(recording.poses))
-        return _report_rate(recording)
-
-
-def _report_rate(recording: Recording) -> Recording:
-    """The recording with a remark where its time stamps have no plausible rate, which no option corrects."""
-    if recording.times is None or len(recording) < 2:
-        return recording
-    times, nominal = recording.times.numpy(), recording.rate_hz
-    if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < _MEASURED_RATE_REL:
-        nominal = None  # a rate that was measured by the same stamps
-    remark = describe_rate(times, nominal)
-    return recording if remark is None else replace(recording, report=(*recording.report, remark))
+        # The recording with a remark where its time stamps have no plausible rate, which no option corrects
+        if recording.times is None or len(recording) < 2:
+            return recording
+        times, nominal = recording.times.numpy(), recording.rate_hz
+        if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < _MEASURED_RATE_REL:
+            nominal = None  # a rate that was measured by the same stamps
+        remark = describe_rate(times, nominal)
+        return recording if remark is None else replace(recording, report=(*recording.report, remark))
 
 
 @dataclass(frozen=True)

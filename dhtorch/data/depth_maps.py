@@ -205,7 +205,13 @@ def _match_files(
     folder: Path, map_files: Sequence[Path], frames: Sequence[int]
 ) -> tuple[list[Path | None], str, list[str]]:
     """The file of every frame (None = no map), whether they were matched by ``"number"`` or ``"order"``, warnings."""
-    numbers_of = _file_numbers(map_files)
+    # Number of every file, None without one: the last number by which all names differ, else the last in its
+    # name
+    rows = [_numbers_in_name(file) for file in map_files]
+    patterns = {re.sub(r"\d+", "0", file.stem) for file in map_files}
+    columns = list(zip(*rows, strict=True)) if len(patterns) == 1 else []
+    distinct = [column for column in columns if len(set(column)) == len(map_files)]
+    numbers_of = [*distinct[-1]] if distinct else [row[-1] if row else None for row in rows]
     frame_numbers, file_numbers = set(frames), {n for n in numbers_of if n is not None}
     description = format_count(len(map_files), "map")
     if file_numbers:
@@ -236,15 +242,6 @@ def _describe_frames(frames: Sequence[int]) -> str:
 def _numbers_in_name(file: Path) -> list[int]:
     """All integers in a file's name, as a key for natural order (10 after 9)."""
     return [int(digits) for digits in re.findall(r"\d+", file.stem)]
-
-
-def _file_numbers(map_files: Sequence[Path]) -> list[int | None]:
-    """Number of every file, None without one: the last number by which all names differ, else the last in its name."""
-    rows = [_numbers_in_name(file) for file in map_files]
-    patterns = {re.sub(r"\d+", "0", file.stem) for file in map_files}
-    columns = list(zip(*rows, strict=True)) if len(patterns) == 1 else []
-    distinct = [column for column in columns if len(set(column)) == len(map_files)]
-    return [*distinct[-1]] if distinct else [row[-1] if row else None for row in rows]
 
 
 def _index_by_number(map_files: Sequence[Path], numbers: Sequence[int]) -> dict[int, Path]:

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from dhtorch.data.codecs import matroska
+from dhtorch.data.codecs import video
 from dhtorch.data.io.decode import FormatError
 
 _ZED: Final = ("a ZED recording", "ZED_SVO_Export {} FOLDER 4 (ZED SDK: left pictures and 16-bit depth)")
@@ -219,7 +219,10 @@ def describe_foreign_file(file: Path) -> ForeignFile | None:
     if file.suffix.lower() in _MODEL_SUFFIXES:
         return ForeignFile("a finished 3D model without its frames", export=f"the frames, {PHONE_EXPORTS}")
     return (
-        ForeignFile(_describe_video(file), export=_export_of_video(file))
+        ForeignFile(
+            _describe_video(file),
+            export=f"colour and depth, {PHONE_EXPORTS}" if file.suffix.lower() in (".mp4", ".mov") else None,
+        )
         if file.suffix.lower() in _VIDEO_SUFFIXES
         else None
     )
@@ -295,16 +298,11 @@ def describe_foreign_folder(folder: Path) -> ForeignFile | None:
     return ForeignFile(f"arrays ({entries[0].name}, …) and no images", export=remedy)
 
 
-def _export_of_video(file: Path) -> str | None:
-    """What to export instead of a phone's plain video; None for videos of other devices."""
-    return f"colour and depth, {PHONE_EXPORTS}" if file.suffix.lower() in (".mp4", ".mov") else None
-
-
 def _describe_video(file: Path) -> str:
     if file.suffix.lower() != ".mkv":
         return f"a video without depth; {NEEDS_DEPTH}"
     try:
-        tracks = matroska.list_video_tracks(file)
+        tracks = video.list_video_tracks(file)
     except FormatError as error:
         return f"a video that cannot be read ({error.args[1]}: {error.args[2]})"
     if len(tracks) < 2:

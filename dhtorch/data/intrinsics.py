@@ -71,21 +71,17 @@ def parse_intrinsics(
     if isinstance(value, str):
         return ParsedIntrinsics(feature=value)
     if isinstance(value, int | float) and name != "K":
-        numbers = _intrinsics_from_fov(value, hw, root, name)
+        # Horizontal field of view in degrees → fx, fy, cx, cy in px, square pixels around the image centre
+        if isinstance(value, bool) or not 1 <= value < 179:
+            raise FormatError(root, f"option {name}", value, "1 to 179 degrees, the horizontal field of view")
+        h, w = hw
+        f = float(w / 2 / np.tan(np.radians(value) / 2))
+        numbers = f, f, (w - 1) / 2, (h - 1) / 2
         source = f"a field of view of {value:g}° (data.{name})"
         report = f"{_GUESS_PREFIX} from {source}: depth and sigma are as accurate as this guess"
         warnings.warn(f"{root.resolve().name}: {report}", stacklevel=2)
         return ParsedIntrinsics(numbers, report=(report,))
     return ParsedIntrinsics(tuple(to_array(value, (4,), root, f"option {name}").tolist()))
-
-
-def _intrinsics_from_fov(degrees: float, hw: tuple[int, int], root: Path, name: str = "fov") -> tuple[float, ...]:
-    """Horizontal field of view in degrees → fx, fy, cx, cy in px, square pixels around the image centre."""
-    if isinstance(degrees, bool) or not 1 <= degrees < 179:
-        raise FormatError(root, f"option {name}", degrees, "1 to 179 degrees, the horizontal field of view")
-    h, w = hw
-    f = float(w / 2 / np.tan(np.radians(degrees) / 2))
-    return f, f, (w - 1) / 2, (h - 1) / 2
 
 
 def find_guess_report(report: Sequence[str]) -> str | None:

@@ -330,11 +330,11 @@ def test_bad_tiff(tmp_path: Path) -> None:
 
     for content, message in (
         (b"II+\0" + good[4:], "content: found b'II"),
-        (good[:100], "directory: found one beyond the 100 bytes"),
-        (tag(256, 2**31), "size: found 2147483648x5, expected 1 to"),
+        (good[:100], "data: found "),
+        (tag(256, 2**31), "size: found 2147483648x5, expected 1 to|data"),
         (tag(256, 0), "size: found 0x5"),
         (tag(257, 6), "strips: found 140 bytes, expected 168 bytes"),
-        (tag(258, 12), "samples: found 12 bits of kind f"),
+        (tag(258, 12), "samples: found 12 bits"),
         (tag(259, 7), "layout: found 1 samples per pixel, compression 7"),
         (tag(259, 8), "data: found "),  # deflated, it says
         (tag(273, 300), "strips: found 1 offsets, 1 sizes, expected all inside the file"),

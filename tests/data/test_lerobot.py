@@ -467,8 +467,8 @@ def test_a_wrong_stamp_does_not_reorder_numbered_rows(tmp_path: Path) -> None:
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lerobot(tmp_path, two_episodes(), image="image", depth="tiff")
     asked: list[str] = []
-    read = codec_parquet._read_open_columns
-    monkeypatch.setattr(codec_parquet, "_read_open_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
+    read = codec_parquet.read_columns
+    monkeypatch.setattr(codec_parquet, "read_columns", lambda f, c, rows: asked.extend(c) or read(f, c, rows))
     recording = data.open(tmp_path, episode=1)
     assert KEY not in asked
     for frame in recording:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dhtorch.data.codecs import parquet, thrift
+from dhtorch.data.codecs import parquet
 from dhtorch.data.io.decode import FormatError
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -24,7 +24,7 @@ def test_chunks_are_those_that_arrow_sees(tmp_path, codec):
         seen = [meta.row_group(g).column(i) for g in groups for i in range(meta.num_columns)]
         found = parquet._read_chunks(file, frozenset(groups))
         want = [(c.path_in_schema, c.physical_type, c.num_values, c.total_compressed_size) for c in seen]
-        assert [(c.path, parquet._PHYSICAL_TYPES[c.kind], c.values, c.packed) for c in found] == want
+        assert [(c.path, c.kind, c.values, c.packed) for c in found] == want
     assert parquet.read_columns(file, ["text"], (60, 62))["text"] == ["a" * 50, "b"]
 
 
@@ -46,16 +46,20 @@ def test_a_file_that_changed_is_read_again(tmp_path):
         assert parquet.read_columns(file, ["x"])["x"].tolist() == list(range(n))
 
 
-def test_a_cell_costs_one_footer_and_columns_that_are_not_there_none(tmp_path, monkeypatch):
-    file, opened, real = tmp_path / "x.parquet", [], parquet._open_table
+def test_cells_and_columns_that_are_not_there(tmp_path):
+    file = tmp_path / "x.parquet"
     arrow.write_table(table(), file, row_group_size=50)
-    monkeypatch.setattr(parquet, "_open_table", lambda path: opened.append(path) or real(path))
-    assert [parquet.read_cell(file, "number", row) for row in (60, 61, 99)] == [60, 61, 99] and len(opened) == 1
-    assert parquet.read_cell(file, "number", 100) == 100 and len(opened) == 2, "another group"
+    assert [parquet.read_cell(file, "number", row) for row in (60, 61, 99, 100, 199)] == [60, 61, 99, 100, 199]
     read = parquet.read_columns(file, ["number"], (0, 2), optional=["text", "gone"])
-    assert list(read) == ["number", "text"] and read["text"] == ["a" * 50, "b"] and len(opened) == 3
-    with pytest.raises(FormatError, match="gone"):
-        parquet.read_columns(file, ["gone"])
+    assert list(read) == ["number", "text"] and read["text"] == ["a" * 50, "b"]
+    for call, named in (
+        (lambda: parquet.read_columns(file, ["gone"]), "columns: found .*, expected gone"),
+        (lambda: parquet.read_columns(file, ["number"], (0, 201)), "rows: found 200, expected rows 0 to 200"),
+        (lambda: parquet.read_cell(file, "number", 200), "rows: found 200, expected row 200"),
+        (lambda: parquet.read_cell(file, "number", -1), "rows: found 200, expected row -1"),
+    ):
+        with pytest.raises(FormatError, match=named):
+            call()
 
 
 @pytest.mark.parametrize(
@@ -63,14 +67,16 @@ def test_a_cell_costs_one_footer_and_columns_that_are_not_there_none(tmp_path, m
 )
 def test_damaged_structures_raise(damaged):
     with pytest.raises((ValueError, IndexError)):
-        list(thrift.iter_list_structs(damaged, 0, 4))
+        list(parquet._Thrift(damaged).iter_structs(4))
 
 
-def test_a_byte_and_a_double_in_thrift():
-    said = bytes([0x13, 100, 0x17, *8 * [9], 0x13, 7, 0])
-    assert thrift.parse_struct(b"??" + said, 2) == ({1: 100, 2: None, 3: 7}, 2 + len(said))
-
-
-def test_a_structure_in_thrift():
-    said = bytes([0x15, 0x04, 0x18, 2, 104, 105, 0x19, 0x25, 1, 4, 0x11, 0x1C, 0x15, 5, 0, 0])
-    assert thrift.parse_struct(said, 0) == ({1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}, len(said))
+@pytest.mark.parametrize(
+    ("said", "values"),
+    [
+        ([0x13, 100, 0x17, *8 * [9], 0x13, 7, 0], {1: 100, 2: 8 * b"\t", 3: 7}),
+        ([0x15, 4, 0x18, 2, 104, 105, 0x19, 0x25, 1, 4, 0x11, 0x1C, 0x15, 5, 0, 0], {1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}),
+    ],
+)  # fmt: skip
+def test_a_structure_in_thrift(said, values):
+    data = parquet._Thrift(bytes(said))
+    assert (data.struct(), data.at) == (values, len(said))

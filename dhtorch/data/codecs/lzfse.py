@@ -48,29 +48,24 @@ def lzfse_unpacked_size(data: bytes, file: Path, field: str) -> int:
     at, size = 0, 0
     while data[at : at + 4] != _END_OF_STREAM:
         try:
-            raw, length = _parse_block(data, at)
+            # (unpacked bytes, bytes in the stream) of the block at offset ``at``
+            kind, raw = struct.unpack_from("<4sI", data, at)
+            if kind == b"bvx-":  # stored
+                length = 8 + raw
+            elif kind == b"bvxn":  # LZVN
+                length = 12 + struct.unpack_from("<I", data, at + 8)[0]
+            elif kind == b"bvx2":  # packed tables: 20-bit payload sizes, 32-bit size of the header
+                first, second, third = struct.unpack_from("<QQQ", data, at + 8)
+                length = (third & 0xFFFFFFFF) + (first >> 20 & 0xFFFFF) + (second >> 40 & 0xFFFFF)
+            else:  # bvx1, with uncompressed tables, is specified but not written by encoders
+                raise KeyError(kind)
+            if length < 8:
+                raise KeyError(kind)
         except (struct.error, KeyError):
             problem = f"{data[at : at + 4]!r} at byte {at} of {len(data)}"
             raise FormatError(file, field, problem, "a whole LZFSE block") from None
         at, size = at + length, size + raw
     return size
-
-
-def _parse_block(data: bytes, at: int) -> tuple[int, int]:
-    """(unpacked bytes, bytes in the stream) of the block at offset ``at``."""
-    kind, raw = struct.unpack_from("<4sI", data, at)
-    if kind == b"bvx-":  # stored
-        length = 8 + raw
-    elif kind == b"bvxn":  # LZVN
-        length = 12 + struct.unpack_from("<I", data, at + 8)[0]
-    elif kind == b"bvx2":  # packed tables: 20-bit payload sizes, 32-bit size of the header
-        first, second, third = struct.unpack_from("<QQQ", data, at + 8)
-        length = (third & 0xFFFFFFFF) + (first >> 20 & 0xFFFFF) + (second >> 40 & 0xFFFFF)
-    else:  # bvx1, with uncompressed tables, is specified but not written by encoders
-        raise KeyError(kind)
-    if length < 8:
-        raise KeyError(kind)
-    return raw, length
 
 
 def _decoder_errors(decoder: ModuleType) -> tuple[type[Exception], ...]:

@@ -6,14 +6,13 @@ headers must add up to the footer's and stay below a limit, so that a page canno
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs import thrift
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.runtime.safe_open import (
     MAX_FILE_BYTES,
@@ -74,14 +73,7 @@ def read_columns(
     """
     table, header = _open_table(file)
     columns = [*columns, *(name for name in optional if name in header.columns and name not in columns)]
-    return _read_open_columns(file, (table, header), columns, rows or (0, header.rows))
-
-
-def _read_open_columns(
-    file: Path, opened: tuple[Any, ParquetHeader], columns: Sequence[str], rows: tuple[int, int]
-) -> dict[str, np.ndarray | list[Any]]:
-    """As :func:`read_columns`, of an opened table."""
-    (table, header), (first, end) = opened, rows
+    first, end = rows or (0, header.rows)
     missing = [name for name in columns if name not in header.columns]
     if missing:
         raise FormatError(file, "columns", ", ".join(header.columns), ", ".join(missing))
@@ -110,26 +102,22 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     Raises:
         FormatError: as :func:`read_columns`.
     """
-    key = (file, read_version(file), column)
-    first, values = _row_group_cache.get(key, (0, ()))
-    if not first <= row < first + len(values):
-        _row_group_cache.pop(key, None)
-        while len(_row_group_cache) >= _MAX_CACHED:
-            _row_group_cache.popitem(last=False)
-        table, header = _open_table(file)
-        starts = header.groups
-        if not 0 <= row < starts[-1]:
-            raise FormatError(file, "rows", starts[-1], f"row {row}")
-        group = int(np.searchsorted(starts, row, "right")) - 1
-        rows = starts[group], starts[group + 1]
-        first, values = rows[0], _read_open_columns(file, (table, header), [column], rows)[column]
-        _row_group_cache[key] = (first, values)
-    return values[row - first]
+    version = read_version(file)
+    starts = _cached_header(file, version).groups
+    if not 0 <= row < starts[-1]:
+        raise FormatError(file, "rows", starts[-1], f"row {row}")
+    group = int(np.searchsorted(starts, row, "right")) - 1
+    return _cached_rows(file, version, column, (starts[group], starts[group + 1]))[row - starts[group]]
 
 
-#: Cache of row groups: (file, its version, column) → first row and values.
-_row_group_cache: OrderedDict[tuple[Path, tuple[int, ...], str], tuple[int, Any]] = OrderedDict()
-_MAX_CACHED = 4
+@lru_cache(maxsize=4)
+def _cached_header(file: Path, version: tuple[int, ...]) -> ParquetHeader:
+    return read_parquet_header(file)
+
+
+@lru_cache(maxsize=4)
+def _cached_rows(file: Path, version: tuple[int, ...], column: str, rows: tuple[int, int]) -> Any:
+    return read_columns(file, [column], rows)[column]
 
 
 def _open_table(file: Path) -> tuple[Any, ParquetHeader]:
@@ -197,29 +185,29 @@ def _column_to_array(column: Any, file: Path, name: str) -> np.ndarray | list[An
 # ------------------------------------------------------------------------------------------------------------ pages
 
 
+#: Physical types and codecs, indexed by their numbers in a footer.
+_PHYSICAL_TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+_CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
+_TYPE_BYTES = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
+_DAMAGE = (IndexError, KeyError, TypeError, ValueError, AttributeError)  # errors of the parser below
+
+
 class _Chunk(NamedTuple):
     """One column of one row group, as described in the footer."""
 
     path: str
-    kind: int  # index in _PHYSICAL_TYPES
-    codec: int  # index in _CODECS
+    kind: str  # of _PHYSICAL_TYPES
+    codec: str  # of _CODECS
     values: int
     unpacked: int  # bytes, with page headers
     packed: int
     start: int  # of the first page
 
 
-#: Physical types and codecs, indexed by their numbers in a footer.
-_PHYSICAL_TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
-_CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
-_TYPE_BYTES = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
-_STRING_TYPES = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
-
-
 def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> None:
     """Raise FormatError where a chunk's pages, by their headers, unpack to more than the footer's size or the limit."""
-    total = 0
     chunks = _read_chunks(file, frozenset(groups))
+    total = 0
     with open_regular(file) as stream:
         limit = max(_MAX_UNPACKED_BYTES, MAX_MEMORY_RATIO * stream.seek(0, 2))
         for chunk in chunks:
@@ -231,62 +219,51 @@ def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> N
 
 def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
     """The chunks of the given row groups; parsed here, since Arrow aborts the process on damaged chunk metadata."""
-    key = (file, read_version(file), groups)
-    if key in _chunk_cache:
-        return _chunk_cache[key]
     size = _footer_size(file)
     with open_regular(file) as stream:
         stream.seek(-8 - size, 2)
         footer = stream.read(size)
+    chunks = []
     try:
-        enumerated = enumerate(thrift.iter_list_structs(footer, 0, 4))
-        chunks = [_parse_chunk(column[3]) for g, group in enumerated if g in groups for column in group[1]]
-    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+        for number, group in enumerate(_Thrift(footer).iter_structs(4)):
+            for fields in (column[3] for column in group[1]) if number in groups else ():
+                start, dictionary = int(fields[9]), int(fields.get(11) or 0)
+                kind, codec, values, unpacked, packed = (int(fields[k]) for k in (1, 4, 5, 6, 7))
+                path = b".".join(fields[3]).decode("utf-8", "replace")
+                if min(kind, codec) < 0:
+                    raise ValueError(f"type {kind} and codec {codec} of {path}")
+                start = dictionary if 0 < dictionary < start else start
+                names = _PHYSICAL_TYPES[kind], _CODECS[codec]
+                chunks.append(_Chunk(path, *names, values, unpacked, packed, start))
+    except _DAMAGE as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
-    while len(_chunk_cache) >= _MAX_CACHED:
-        _chunk_cache.popitem(last=False)
-    _chunk_cache[key] = chunks
     return chunks
-
-
-#: Cache of chunks: (file, its version, row groups) → chunks.
-_chunk_cache: OrderedDict[tuple[Path, tuple[int, ...], frozenset[int]], list[_Chunk]] = OrderedDict()
-
-
-def _parse_chunk(fields: dict[int, Any]) -> _Chunk:
-    path = b".".join(fields[3]).decode("utf-8", "replace")
-    start, dictionary = int(fields[9]), int(fields.get(11) or 0)
-    start = dictionary if 0 < dictionary < start else start
-    numbers = [int(fields[k]) for k in (1, 4, 5, 6, 7)]
-    if not (0 <= numbers[0] < len(_PHYSICAL_TYPES) and 0 <= numbers[1] < len(_CODECS)):
-        raise ValueError(f"type {numbers[0]} and codec {numbers[1]} of {path}")
-    return _Chunk(path, numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
 
 
 def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
     """Unpacked bytes of the pages of one column chunk."""
-    values = unpacked = at = 0
-    width = _TYPE_BYTES.get(_PHYSICAL_TYPES[chunk.kind], 8)
+    values = unpacked = 0
+    width = _TYPE_BYTES.get(chunk.kind, 8)
     if chunk.start < 4 or not 0 <= chunk.packed <= MAX_FILE_BYTES:
         raise FormatError(file, chunk.path, f"{chunk.packed} bytes at {chunk.start}", "a column inside the file")
     stream.seek(chunk.start)
-    data = stream.read(chunk.packed)
-    while at < len(data) and values < chunk.values:
+    data = _Thrift(stream.read(chunk.packed))
+    while data.at < len(data.bytes) and values < chunk.values:
         try:
-            page, at = thrift.parse_struct(data, at)
+            page = data.struct()
             full, packed = int(page[2]), int(page[3])
             inner = page.get(5) or page.get(8) or {}
             count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
-        except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except _DAMAGE as error:
             raise FormatError(file, chunk.path, f"a page header: {error}", "a whole page") from None
-        if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.unpacked:
+        if min(full, packed, count) < 0 or packed > len(data.bytes) - data.at or full > chunk.unpacked:
             problem = f"a page of {packed} bytes that unpack into {full}"
             raise FormatError(file, chunk.path, problem, f"at most {chunk.unpacked}")
         values += count
-        if entries and _PHYSICAL_TYPES[chunk.kind] in _STRING_TYPES:
-            width = max(width, _longest_dictionary_entry(file, chunk, data[at : at + packed], full))
+        if entries and chunk.kind.endswith("BYTE_ARRAY"):
+            width = max(width, _longest_dictionary_entry(file, chunk, data.bytes[data.at : data.at + packed], full))
         unpacked += max(full, width * max(count, entries))
-        at += packed
+        data.at += packed
     if values != chunk.values:
         raise FormatError(file, chunk.path, f"pages of {values} values", chunk.values)
     return unpacked
@@ -295,12 +272,12 @@ def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
 def _longest_dictionary_entry(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:
     """Bytes of a dictionary's longest entry: a row takes a few bits in the file but a whole entry in memory."""
     pyarrow = import_optional("pyarrow")
-    if full > _MAX_UNPACKED_BYTES or _PHYSICAL_TYPES[chunk.kind] != "BYTE_ARRAY":
+    if full > _MAX_UNPACKED_BYTES or chunk.kind != "BYTE_ARRAY":
         return full  # a fixed length is at most the whole page
+    plain = packed
     try:
-        plain = packed
-        if _CODECS[chunk.codec] != "UNCOMPRESSED":
-            plain = pyarrow.Codec(_CODECS[chunk.codec].lower()).decompress(packed, full, asbytes=True)
+        if chunk.codec != "UNCOMPRESSED":
+            plain = pyarrow.Codec(chunk.codec.lower()).decompress(packed, full, asbytes=True)
     except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:
         raise FormatError(file, chunk.path, error, "a dictionary that unpacks") from None
     at = longest = 0
@@ -308,3 +285,82 @@ def _longest_dictionary_entry(file: Path, chunk: _Chunk, packed: bytes, full: in
         length = int.from_bytes(plain[at : at + 4], "little")
         at, longest = at + 4 + length, max(longest, length)
     return longest
+
+
+class _Thrift:
+    """Values of Thrift's compact protocol in turn, as far as Parquet uses it; damage is one of ``_DAMAGE``."""
+
+    def __init__(self, data: bytes) -> None:
+        self.bytes, self.at = data, 0
+
+    def struct(self, depth: int = 0) -> dict[int, Any]:
+        """The structure here: field number → value."""
+        return {number: self._value(kind, depth) for number, kind in self._fields()}
+
+    def iter_structs(self, field: int) -> Iterator[dict[int, Any]]:
+        """The structures in the list that is this field of the structure here, one by one."""
+        for number, kind in self._fields():
+            if number != field or kind != 9:
+                self._value(kind, 0)
+                continue
+            count, item_kind = self._list_header()
+            if item_kind != 12:
+                raise ValueError(f"a list of type {item_kind}")
+            for _ in range(count):
+                yield self.struct(1)
+            return
+        raise ValueError(f"no list in field {field}")
+
+    def _fields(self) -> Iterator[tuple[int, int]]:
+        """(number, type) of each field of a structure; its value stands here."""
+        number = 0
+        while head := self._byte():
+            number = number + (head >> 4) if head >> 4 else self._zigzag()
+            yield number, head & 15
+
+    def _value(self, kind: int, depth: int, in_list: bool = False) -> Any:
+        if depth > 12:  # a Parquet footer has nine levels of structures and lists
+            raise ValueError("structures nested too deep")
+        if kind in (1, 2):  # true and false are encoded in the type; in a list they take a byte
+            return self._byte() == 1 if in_list else kind == 1
+        if kind in (4, 5, 6):
+            return self._zigzag()
+        if kind == 3:
+            return self._byte()
+        if kind in (7, 8):  # a double, which is not needed, or a string
+            length = 8 if kind == 7 else self._varint()
+            if length > len(self.bytes) - self.at:
+                raise ValueError("a string beyond the end")
+            self.at += length
+            return self.bytes[self.at - length : self.at]
+        if kind in (9, 10):
+            count, kind = self._list_header()
+            return [self._value(kind, depth + 1, in_list=True) for _ in range(count)]
+        if kind == 12:
+            return self.struct(depth + 1)
+        raise ValueError(f"a field of type {kind}")
+
+    def _list_header(self) -> tuple[int, int]:
+        """(length, type) of a list."""
+        head = self._byte()
+        count = head >> 4 if head >> 4 < 15 else self._varint()
+        if count > len(self.bytes) - self.at:  # every value takes at least a byte
+            raise ValueError(f"a list of {count} values in {len(self.bytes) - self.at} bytes")
+        return count, head & 15
+
+    def _byte(self) -> int:
+        self.at += 1
+        return self.bytes[self.at - 1]
+
+    def _varint(self) -> int:
+        number = 0
+        for shift in range(0, 70, 7):
+            byte = self._byte()
+            number |= (byte & 127) << shift
+            if byte < 128:
+                return number
+        raise ValueError("an unterminated number")
+
+    def _zigzag(self) -> int:
+        number = self._varint()
+        return (number >> 1) ^ -(number & 1)

@@ -68,7 +68,15 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
         header = os.pread(stream, _BLOCK_BYTES, at)
         if not header.strip(b"\0"):
             return
-        name, kind, size = _parse_header(file, header, at)
+        stored = _parse_number(header[148:156])
+        if stored != sum(header[:148]) + 8 * 32 + sum(header[156:]):
+            raise FormatError(file, f"header at byte {at}", "a wrong checksum", "a tar header, not compressed")
+        size = _parse_number(header[124:136])
+        if size is None or size < 0:
+            raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
+        name, kind = _decode_text(header[:100]), header[156:157]
+        folder = _decode_text(header[345:500]) if header[257:263] == b"ustar\0" else ""
+        name = f"{folder}/{name}" if folder else name
         size = _parse_pax_size(file, special["size"], at) if "size" in special else size
         size = 0 if kind in _KINDS_WITHOUT_DATA else size
         data, at = at + _BLOCK_BYTES, at + _BLOCK_BYTES + (size + _BLOCK_BYTES - 1) // _BLOCK_BYTES * _BLOCK_BYTES
@@ -87,18 +95,6 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
         special = {}
     if at == 0:
         raise FormatError(file, "content", f"{total} bytes", "a tar archive")
-
-
-def _parse_header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
-    """(name, type, size) of a member, from its header."""
-    stored = _parse_number(header[148:156])
-    if stored != sum(header[:148]) + 8 * 32 + sum(header[156:]):
-        raise FormatError(file, f"header at byte {at}", "a wrong checksum", "a tar header, not compressed")
-    size = _parse_number(header[124:136])
-    if size is None or size < 0:
-        raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
-    name, folder = _decode_text(header[:100]), _decode_text(header[345:500]) if header[257:263] == b"ustar\0" else ""
-    return (f"{folder}/{name}" if folder else name), header[156:157], size
 
 
 def _parse_pax_size(file: Path, text: str, at: int) -> int:

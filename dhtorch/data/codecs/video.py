@@ -1,4 +1,4 @@
-"""Codec of videos: frames of a file by number or time, at constant memory.
+"""Codec of videos by PyAV: frames of a file by number or time, at constant memory; tracks and attachments of Matroska.
 
 Frame ``i`` is the ``i``-th in *presentation order*, whatever the order in the file. It is located by a table of
 presentation times, made by reading the packets once without decoding; a frame that cannot be decoded is therefore an
@@ -7,27 +7,98 @@ previous key frame.
 
 A few decoders per process stay open, cached by file name: callers hold only paths and are picklable, and a forked
 worker opens its own decoders.
+
+The samples that an mp4 declares are counted before FFmpeg allocates memory for them: some tables are short for any
+number of samples, all of one size, runs of one duration, fragments of defaults.
 """
 
 from __future__ import annotations
 
 import os
+import struct
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count, read_display_symmetry
 from dhtorch.data.io.decode import FormatError, import_optional
-from dhtorch.runtime.safe_open import open_regular, read_version
+from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, check_memory, open_regular, read_version
 
 _MAX_VIDEO_PIXELS = 36_000_000  # pixels, 8K; a decoder holds up to 17 frames
 _MAX_FRAMES = 10_000_000
 _MAX_OPEN_DECODERS = 8  # decoders in a process
 _MAX_FAILED_PACKETS = 100  # consecutive undecodable packets after which decoding stops
 _MAX_DECODE_AHEAD_FRAMES = 60  # frames up to which decoding on is cheaper than seeking a key frame
+
+#: Types of the first box of an mp4.
+_MP4_FIRST_BOXES: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
+_CONTAINER_BOXES: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf", b"edts", b"mvex")
+#: Box -> offset in it of a number of samples.
+_COUNT_AT: Final = {b"stsz": 8, b"stz2": 8, b"trun": 4}
+_RUN_LENGTH_BOXES: Final = (b"stts", b"ctts")  # tables of (count, value)
+_BYTES_PER_SAMPLE: Final = 200  # memory of a decoder and of our table per sample
+_MAX_DEPTH, _MAX_BOXES = 12, 200_000  # of an mp4
+#: (a, b, c, d) of a track's matrix, x' = a x + c y and y' = b x + d y in an image with y down -> symmetry of
+#: :mod:`dhtorch.data.orientation`.
+SYMMETRY_OF_MATRIX: Final = {
+    (1, 0, 0, 1): 0,
+    (0, 1, -1, 0): 1,
+    (-1, 0, 0, -1): 2,
+    (0, -1, 1, 0): 3,
+    (-1, 0, 0, 1): 4,
+    (0, -1, -1, 0): 5,
+    (1, 0, 0, -1): 6,
+    (0, 1, 1, 0): 7,
+}
+
+
+class VideoTrack(NamedTuple):
+    """A video track as its container describes it."""
+
+    name: str
+    codec: str  # FFmpeg's name
+    fourcc: str  # code of the codec, such as b16g; empty where the container has none
+    hw: tuple[int, int]
+
+
+def list_video_tracks(file: Path) -> list[VideoTrack]:
+    """The video tracks of a file in the order of its header; decodes no frame.
+
+    Raises:
+        FormatError: no video file, or a damaged header.
+    """
+    with _opened(file) as (container, errors):
+        try:
+            contexts = [(stream.metadata.get("title", ""), stream.codec_context) for stream in container.streams.video]
+            return [
+                VideoTrack(name, context.name, context.codec_tag.strip("\0"), (context.height, context.width))
+                for name, context in contexts
+                if context is not None
+            ]
+        except errors as error:
+            raise FormatError(file, "tracks", error, "a video file") from None
+
+
+def read_attachment(file: Path, name: str) -> bytes | None:
+    """Content of the attached file called ``name``; None where there is none.
+
+    Raises:
+        FormatError: no video file, or more than ``MAX_TEXT_BYTES``.
+        ImportError: PyAV before 16 does not give the content.
+    """
+    with _opened(file) as (container, _):
+        for stream in container.streams:
+            if stream.type == "attachment" and stream.metadata.get("filename") == name:
+                if not hasattr(stream, "data"):
+                    raise ImportError(f"{file}: the attachment {name} needs PyAV 16: pip install 'av>=16'")
+                content = bytes(stream.data or b"")
+                if len(content) > MAX_TEXT_BYTES:
+                    raise FormatError(file, name, f"{len(content)} bytes", f"at most {MAX_TEXT_BYTES}")
+                return content
+    return None
 
 
 class VideoHeader(NamedTuple):
@@ -99,18 +170,14 @@ def read_video_frame(
             file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{expected_hw[1]}x{expected_hw[0]}"
         )
     if pixels == "luma":
-        return _extract_luma(frame)
+        plane, kind = frame.planes[0], np.dtype("<u2" if frame.format.components[0].bits > 8 else "u1")
+        rows = np.frombuffer(plane, kind).reshape(-1, plane.line_size // kind.itemsize)  # rows may be padded
+        return rows[: frame.height, : frame.width].copy()
     try:
         interpolation = "POINT" if nearest else "BICUBIC"
         return np.asarray(frame.to_ndarray(format=pixels, interpolation=interpolation, **decoder.one_thread))
     except decoder.errors as error:
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
-
-
-def _extract_luma(frame: Any) -> np.ndarray:
-    plane, is_16bit = frame.planes[0], frame.format.components[0].bits > 8
-    rows = np.frombuffer(plane, "<u2" if is_16bit else np.uint8).reshape(-1, plane.line_size // (2 if is_16bit else 1))
-    return rows[: frame.height, : frame.width].copy()
 
 
 def close_videos() -> None:
@@ -120,18 +187,89 @@ def close_videos() -> None:
     _open_decoders.clear()
 
 
-def _check_container(file: Path, track: int) -> tuple[str, int]:
-    """FFmpeg's names of a container format, from its first bytes, and display symmetry; checks an mp4's samples."""
+def _open_container(file: Path, *, all_frames: bool, track: int) -> tuple[Any, int, tuple[type[Exception], ...]]:
+    """(container, display symmetry, FFmpeg's errors) of a file whose first bytes are those of a video."""
+    av = import_optional("av")
+    errors = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
+    display = 0
     with open_regular(file) as stream:
         head = stream.read(16)
-        if head[4:8] in MP4_FIRST_BOXES:
-            check_sample_count(stream, file)
-            return "mov,mp4,m4a,3gp,3g2,mj2", read_display_symmetry(stream, track)
-    if head.startswith(b"\x1a\x45\xdf\xa3"):
-        return "matroska,webm", 0
-    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-        return "avi", 0
-    raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
+        if head[4:8] in _MP4_FIRST_BOXES:
+            formats, display = "mov,mp4,m4a,3gp,3g2,mj2", _inspect_mp4(stream, file, track)
+        elif head.startswith(b"\x1a\x45\xdf\xa3"):  # identifier of an EBML header
+            formats = "matroska,webm"
+        elif head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+            formats = "avi"
+        else:
+            raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
+    # No playlists, no network: the format is fixed and no other file may be opened.
+    limits = {"max_pixels": str(_MAX_VIDEO_PIXELS), "protocol_whitelist": "file", "format_whitelist": formats}
+    edits = {"advanced_editlist": "0"} if all_frames else {}
+    try:
+        container = av.open(str(file), format=formats.partition(",")[0], options=limits, container_options=edits)
+    except errors as error:
+        raise FormatError(file, "content", error, "a video file") from None
+    return container, display, errors
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[tuple[Any, tuple[type[Exception], ...]]]:
+    container, _, errors = _open_container(file, all_frames=False, track=0)
+    with container:
+        yield container, errors
+
+
+def _inspect_mp4(stream: BinaryIO, file: Path, track: int) -> int:
+    """Symmetry of the display matrix of a video track, 0 where it is no quarter turn, after a check of all samples.
+
+    Raises:
+        FormatError: more samples than bytes, or than the memory limit allows, or too many boxes.
+    """
+    total, n_samples, symmetry = stream.seek(0, 2), 0, 0
+    symmetries: list[int] = []  # of the video tracks
+    for number, (kind, start, end) in enumerate(_iter_boxes(stream, 0, total, 0)):
+        if number > _MAX_BOXES:
+            raise FormatError(file, "boxes", f"more than {_MAX_BOXES}", "a file with fewer")
+        stream.seek(start)
+        declared = 0
+        if kind == b"trak":
+            symmetry = 0
+        elif kind == b"tkhd":
+            stream.seek(start + (52 if stream.read(1) == b"\1" else 40))  # by its version
+            a, b, _, c, d = (entry / 65536 for entry in struct.unpack(">5i", stream.read(20).ljust(20, b"\0")))
+            symmetry = SYMMETRY_OF_MATRIX.get((a, b, c, d), 0)
+        elif kind == b"hdlr":
+            symmetries += [symmetry] if stream.read(12)[8:] == b"vide" else []
+        elif kind in _COUNT_AT:
+            declared = int.from_bytes(stream.read(_COUNT_AT[kind] + 4)[_COUNT_AT[kind] :], "big")
+            n_samples += declared
+        elif kind in _RUN_LENGTH_BOXES:
+            if end - start > MAX_TEXT_BYTES:
+                raise FormatError(file, kind.decode(), f"{end - start} bytes", f"at most {MAX_TEXT_BYTES}")
+            table = stream.read(end - start)[8:]
+            declared = sum(n for n, _ in struct.iter_unpack(">II", table[: len(table) // 8 * 8]))
+        if declared > total:
+            raise FormatError(file, kind.decode(), f"{declared} samples in {total} bytes", "at most one per byte")
+        most = max(n_samples, declared)
+        check_memory(file, "samples", _BYTES_PER_SAMPLE * most, f"{most} samples")
+    return symmetries[track] if track < len(symmetries) else 0
+
+
+def _iter_boxes(stream: BinaryIO, at: int, stop: int, depth: int) -> Iterator[tuple[bytes, int, int]]:
+    """(type, start and end of the content) of the boxes of an mp4, depth first; a damaged box ends its container."""
+    while at + 8 <= stop:
+        stream.seek(at)
+        size, kind = struct.unpack(">I4s", stream.read(8))
+        start = at + 8
+        if size == 1:
+            size, start = int.from_bytes(stream.read(8).ljust(8, b"\0"), "big"), start + 8
+        end = stop if size == 0 else at + size
+        if end < start:
+            return
+        yield kind, start, min(end, stop)
+        if kind in _CONTAINER_BOXES and depth < _MAX_DEPTH:
+            yield from _iter_boxes(stream, start, min(end, stop), depth + 1)
+        at = end
 
 
 def _index_entries(stream: Any) -> Any:
@@ -149,26 +287,9 @@ class _Decoder:
         self.keys = np.empty((0, 2), np.int64)  # presentation and decoding stamp of the key frames
         self.frames: Iterator[Any] = iter(())
         self.next = -1  # number of the next decoded frame; −1 = unknown
-        av = import_optional("av")
         # PyAV before 17 converts with one thread and has no such option.
-        self.one_thread = {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
-        self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
-        if not file.exists():
-            raise FormatError(file, "file", "no such file", "a video")
-        container_format, self.display = _check_container(file, track)
-        # No playlists, no network: the format is fixed and no other file may be opened.
-        limits = {
-            "max_pixels": str(_MAX_VIDEO_PIXELS),
-            "protocol_whitelist": "file",
-            "format_whitelist": container_format,
-        }
-        edits = {"advanced_editlist": "0"} if all_frames else {}
-        try:
-            self.container = av.open(
-                str(file), format=container_format.split(",")[0], options=limits, container_options=edits
-            )
-        except self.errors as error:
-            raise FormatError(file, "content", error, "a video file") from None
+        self.one_thread = {"threads": 1} if int(import_optional("av").__version__.partition(".")[0]) >= 17 else {}
+        self.container, self.display, self.errors = _open_container(file, all_frames=all_frames, track=track)
         try:
             self.header = self._start()
         except self.errors as error:

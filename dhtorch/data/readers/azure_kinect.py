@@ -23,7 +23,7 @@ from torch import Tensor
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.clocks import pair_stamps
-from dhtorch.data.codecs import matroska, video
+from dhtorch.data.codecs import video
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
@@ -59,10 +59,10 @@ class _Tracks(NamedTuple):
     depth: int
 
 
-def find_depth_track(file: Path) -> matroska.VideoTrack | None:
+def find_depth_track(file: Path) -> video.VideoTrack | None:
     """The depth track of a Matroska video; None where there is none or the file is no such video."""
     tracks = _find_tracks(file)
-    return None if tracks is None else matroska.list_video_tracks(file)[tracks.depth]
+    return None if tracks is None else video.list_video_tracks(file)[tracks.depth]
 
 
 def recognise(root: Path) -> str | None:
@@ -201,7 +201,7 @@ def _find_tracks(file: Path) -> _Tracks | None:
     if file.suffix.lower() != ".mkv" or not file.is_file():
         return None
     try:
-        tracks = matroska.list_video_tracks(file)
+        tracks = video.list_video_tracks(file)
     except FormatError:
         return None
     names = [track.name.upper() for track in tracks]
@@ -216,7 +216,7 @@ def _find_tracks(file: Path) -> _Tracks | None:
 
 
 def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]) -> _Calibration | None:
-    content = matroska.read_attachment(file, _CALIBRATION)
+    content = video.read_attachment(file, _CALIBRATION)
     if content is None:
         return None
     where = Path(f"{file}/{_CALIBRATION}")

@@ -11,7 +11,7 @@ from typing import Any
 import av
 import numpy as np
 
-from dhtorch.data.codecs.mp4 import SYMMETRY_OF_MATRIX
+from dhtorch.data.codecs.video import SYMMETRY_OF_MATRIX
 from dhtorch.export import video
 
 
