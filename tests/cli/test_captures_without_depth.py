@@ -156,8 +156,8 @@ def test_a_missing_decoder_names_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(ImportError, match=r"needs OpenEXR, which is not installed: pip install OpenEXR$"):
         decode.import_optional("OpenEXR")
-    with pytest.raises(ImportError, match=r"pip install 'dhtorch\[robot\]'"):
-        decode.import_optional("no_such_library", extra="robot")
+    with pytest.raises(ImportError, match=r"pip install 'dhtorch\[live\]'"):
+        decode.import_optional("no_such_library", extra="live")
 
 
 def test_pictures_alone_name_what_to_export(command, tmp_path):

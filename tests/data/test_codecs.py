@@ -11,12 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from support.box_scene import walk
 from support.byte_damage import overwrite
+from support.writers.rosbag import BagLayout, write_rosbag
 from support.writers.video import write_video
 
-from dhtorch.data.codecs import bag_messages, parquet
+from dhtorch import data
 from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.codecs import lzfse as codec_lzfse
+from dhtorch.data.codecs import parquet
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.io import decode as files
@@ -294,8 +298,9 @@ def write_maps(file: Path, value: int) -> None:
     np.save(file, np.full((2, 4, 6), value, np.float32))
 
 
-def read_chunk(file: Path) -> int:
-    return bag_messages.cached_chunk(file, 3, lambda: file.read_bytes()[3:4])[0]
+def write_bag(file: Path, value: int) -> None:
+    frames = [frame.replace(image=torch.full_like(frame.image, value)) for frame in walk(1, hw=(24, 32))]
+    write_rosbag(file, frames, BagLayout("ros1", compression="lz4"))
 
 
 #: Content cached in a process: name of the file, how it is written with a value, and how the value is read.
@@ -303,7 +308,7 @@ CACHED: dict[str, tuple[str, Callable[[Path, int], object], Callable[[Path], obj
     "cell": ("a.parquet", write_table, lambda file: parquet.read_cell(file, "frame_index", 4)),
     "rows": ("a.parquet", write_table, lambda file: read_row_table(file, ())["frame_index"][4]),
     "maps": ("a.npy", write_maps, lambda file: DepthMaps([file], DepthUnit(1.0), (4, 6), clip_index=[1])[0].max()),
-    "chunk": ("a.bag", lambda file, value: file.write_bytes(bytes([value] * 9)), read_chunk),
+    "chunk": ("a.bag", write_bag, lambda file: int(data.open(file)[0].image[0, 0, 0, 0])),
     "frame": (
         "a.mp4",
         lambda file, value: write_video(file, [grey(value)] * 3, [0, 0.1, 0.2], codec="libx264"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import bz2
 import pickle
 import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
 import torch
@@ -15,16 +17,13 @@ from support.box_scene import disagreement, off_wall, own_camera, render, walk, 
 from support.writers.rosbag import BagLayout, BagWriter, write_rosbag
 
 from dhtorch import data
-from dhtorch.data.codecs import ros_images, rosbag1
-from dhtorch.data.codecs.ros_messages import CameraInfo, Header, RawImage
-from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import rosbag_index
+from dhtorch.data.codecs import bags, ros_images
+from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.data.readers.rosbag_index import crop_camera
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-
-pytest.importorskip("rosbags")
 
 STEP = 1e-3  # m, of a code of 16UC1
 CAMERA_FRAME = BagLayout().colour_frame
@@ -51,27 +50,45 @@ STORAGES = {
     "ros1_bz2.bag": BagLayout(storage="ros1", compression="bz2"),
     "ros1_lz4.bag": BagLayout(storage="ros1", compression="lz4"),
 }
+PACKED = "/camera/color/image_raw/compressed"
+PACKED_DEPTH = "/camera/aligned_depth_to_color/image_raw/compressedDepth"
+#: Name of the bag, its layout, largest mean error of the images and largest one of depth.
+BAGS = [
+    *((name, layout, 0, STEP / 2) for name, layout in STORAGES.items()),
+    ("a", BagLayout(colour_encoding="bgr8", depth_encoding="32FC1"), 0, 1e-6),
+    ("a", BagLayout(colour_encoding="rgba8"), 0, STEP / 2),
+    ("a", BagLayout(colour_encoding="bgra8"), 0, STEP / 2),
+    ("a", BagLayout(colour_encoding="png", colour_topic=PACKED, depth_encoding="16UC1 png", depth_topic=PACKED_DEPTH), 0, STEP / 2),
+    ("a", BagLayout(colour_encoding="jpeg", colour_topic=PACKED, depth_encoding="32FC1 png", depth_topic=PACKED_DEPTH), 3, 2e-3),
+    *(
+        (name, BagLayout(storage, depth_encoding=depth, padding=12, big_endian=big), 0, STEP / 2)
+        for depth in ("16UC1", "32FC1")
+        for big in (False, True)
+        for name, storage in (("a", "mcap"), ("a.bag", "ros1"))
+    ),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", STORAGES)
-def test_every_storage_is_read_back(tmp_path: Path, name: str) -> None:
-    frames = walk(4)
-    write_rosbag(tmp_path / name, frames, STORAGES[name])
+@pytest.mark.parametrize(("name", "layout", "image", "depth"), BAGS)
+def test_bags_are_read_back(tmp_path: Path, name: str, layout: BagLayout, image: float, depth: float) -> None:
+    frames = walk(3)
+    write_rosbag(tmp_path / name, frames, layout)
     (recording,) = data.open_all(tmp_path / name)
     assert recording.format == "rosbag" and recording.poses is not None and recording.report == ()
-    assert recording.depth_unit == DepthUnit(STEP, "REP 118: 16UC1")
-    same_frames(recording, frames)
-    assert float(off_wall(world_points(own_camera(recording[1]))).max()) < 2 * STEP
-    assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
+    is_metric = layout.depth_encoding.startswith("32FC1")
+    assert recording.depth_unit == (None if is_metric else DepthUnit(STEP, "REP 118: 16UC1"))
     for part in [] if name.endswith(".bag") else tmp_path.glob(f"{name}/*.[md][cb]*"):
-        same_frames(data.open(part), frames)  # a file of the folder alone
-    same_frames(pickle.loads(pickle.dumps(recording)), frames)
+        same_frames(data.open(part), frames, image=image, depth=depth)  # a file of the folder alone
+    same_frames(pickle.loads(pickle.dumps(recording)), frames, image=image, depth=depth)
+    if depth == STEP / 2:
+        assert float(off_wall(world_points(own_camera(recording[1]))).max()) < 2 * STEP
+        assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
 
 
 def test_messages_have_the_times_at_which_they_were_recorded(tmp_path: Path) -> None:
     frames = walk(2)
     write_rosbag(tmp_path / "a.bag", frames, BagLayout("ros1"))
-    times = {message.time_ns for message in rosbag1.iter_bag_messages(tmp_path / "a.bag")}
+    times = {message.time_ns for message in bags.iter_messages(tmp_path / "a.bag")}
     assert {round(1e9 * float(frame.time)) for frame in frames} <= times
 
 
@@ -94,36 +111,6 @@ def test_chunks_of_mcap_are_decompressed(tmp_path: Path, compression: str) -> No
             out.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         out.finish()
     same_frames(data.open(tmp_path / "a.mcap"), frames)
-
-
-@pytest.mark.parametrize(
-    ("colour", "depth", "image", "error"),
-    [
-        ("bgr8", "32FC1", 0, 1e-6),
-        ("rgba8", "16UC1", 0, STEP / 2),
-        ("bgra8", "16UC1", 0, STEP / 2),
-        ("png", "16UC1 png", 0, STEP / 2),
-        ("jpeg", "32FC1 png", 3, 2e-3),
-    ],
-)
-def test_encodings(tmp_path: Path, colour: str, depth: str, image: float, error: float) -> None:
-    frames = walk(2)
-    packed = {"colour_topic": "/camera/color/image_raw/compressed"} if colour in ("png", "jpeg") else {}
-    if " " in depth:
-        packed["depth_topic"] = "/camera/aligned_depth_to_color/image_raw/compressedDepth"
-    layout = BagLayout(colour_encoding=colour, depth_encoding=depth, **packed)
-    write_rosbag(tmp_path / "bag", frames, layout)
-    recording = data.open(tmp_path / "bag")
-    same_frames(recording, frames, image=image, depth=error)
-    assert (recording.depth_unit is None) == depth.startswith("32FC1")
-
-
-@pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("depth", ["16UC1", "32FC1"])
-def test_padded_rows_and_byte_order(tmp_path: Path, depth: str, big_endian: bool) -> None:
-    frames = walk(2)
-    write_rosbag(tmp_path / "bag", frames, BagLayout(depth_encoding=depth, padding=12, big_endian=big_endian))
-    same_frames(data.open(tmp_path / "bag"), frames)
 
 
 def test_grey_pictures(tmp_path: Path) -> None:
@@ -316,10 +303,11 @@ def test_without_calibration_K_is_asked_for(tmp_path: Path) -> None:
     same_frames(data.open(tmp_path / "bag", K=[61.5, 58.25, 33.5, 21.75]), frames)
 
 
-def info(model: str, D: tuple[float, ...], K: np.ndarray | None = None, **more: tuple[int, int]) -> CameraInfo:
-    K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]) if K is None else K
-    fields = {"hw": (480, 640), "binning": (0, 0), "offset": (0, 0), "roi_hw": (0, 0), **more}
-    return CameraInfo(Header(0, ""), model=model, D=D, K=K, P=np.zeros((3, 4)), **fields)
+def info(model: str, d: Sequence[float], focal: Sequence[float] = (600.0, 600.0), **more: int) -> SimpleNamespace:
+    """A CameraInfo of 640 x 480 pixels."""
+    fields = dict.fromkeys(("binning_x", "binning_y", "x_offset", "y_offset", "roi_height", "roi_width"), 0) | more
+    k = np.array([focal[0], 0, 320, 0, focal[1], 240, 0, 0, 1.0])
+    return SimpleNamespace(height=480, width=640, distortion_model=model, d=np.array(d), k=k, **fields)
 
 
 def test_lens_models() -> None:
@@ -341,7 +329,7 @@ def test_terms_of_a_lens_are_those_of_opencv() -> None:
 def test_an_inverse_lens_model_is_inverted() -> None:
     """Ideal coordinates by the stated polynomial are those that the returned lens maps back to the pixel."""
     D = (-0.05, 0.03, 0.0015, -0.002, -0.01)
-    stated = info("Inverse Brown Conrady", D, np.array([[600.0, 0, 320], [0, 540, 240], [0, 0, 1]]))
+    stated = info("Inverse Brown Conrady", D, (600.0, 540.0))
     wanted = ros_images.to_opencv_distortion(stated, Path("a"))
     camera = Camera(torch.tensor([[600.0, 540]]), torch.tensor([[320.0, 240]]), torch.tensor([wanted]))
     uv = torch.tensor([[[0.0, 0], [639, 0], [320, 479], [100, 333]]])
@@ -359,26 +347,38 @@ def test_an_inverse_lens_model_is_inverted() -> None:
     torch.testing.assert_close(cameras.project(camera, ideal[None]), uv, atol=0.1, rtol=0)
 
 
-def test_region_of_interest_and_binning(tmp_path: Path) -> None:
-    """K of the half-size picture of a region: the same ray passes through the same point of the scene."""
-    from dhtorch.data.readers import rosbag_cameras  # noqa: PLC0415
-
-    K, hw = rosbag_cameras._crop(info("", ()).K, info("", (), binning=(2, 2), offset=(100, 40), roi_hw=(400, 500)))
+def test_region_of_interest_and_binning() -> None:
+    """K of the half-size image of a region: the same ray passes through the same point of the scene."""
+    region = info("", (), binning_x=2, binning_y=2, x_offset=100, y_offset=40, roi_height=400, roi_width=500)
+    K, hw = crop_camera(region.k.reshape(3, 3), region)
     assert hw == (200, 250)
-    # The pixel (120, 60) of the full picture is (20, 20) of the region, whose centre is 20.5 / 2 - 0.5 after binning.
-    u = K[0, 0] * (120 - 320) / 600 + K[0, 2]
-    assert u == pytest.approx((20 + 0.5) / 2 - 0.5)
+    # The pixel (120, 60) of the full image is (20, 20) of the region, whose centre is 20.5 / 2 - 0.5 after binning.
+    for axis, at in enumerate((120, 60)):
+        place = K[axis, axis] * (at - (320, 240)[axis]) / 600 + K[axis, 2]
+        assert place == pytest.approx((20 + 0.5) / 2 - 0.5)
+    assert crop_camera(region.k.reshape(3, 3), info("", ()))[1] == (480, 640)
+
+
+def raw(encoding: str, step: int, pixels: np.ndarray) -> SimpleNamespace:
+    h, w = pixels.shape[:2]
+    return SimpleNamespace(height=h, width=w, encoding=encoding, is_bigendian=0, step=step, data=pixels.reshape(-1))
 
 
 def test_bayer_and_yuv_pictures() -> None:
     red = np.zeros((4, 4), np.uint8)
     red[::2, ::2] = 200  # rggb: red at even rows and columns
-    got = ros_images.decode_colour(RawImage((4, 4), "bayer_rggb8", False, 4, memoryview(red.tobytes())), Path("a"))
+    got = ros_images.decode_colour(raw("bayer_rggb8", 4, red), Path("a"))
     assert got.shape == (3, 4, 4) and int(got[0, 2, 2]) == 200 and int(got[2].max()) == 0
-    grey = np.full((2, 4, 2), 128, np.uint8)
     for encoding in ("uyvy", "yuyv"):
-        image = RawImage((2, 4), encoding, False, 8, memoryview(grey.tobytes()))
+        image = raw(encoding, 8, np.full((2, 4, 2), 128, np.uint8))
         assert int(np.ptp(ros_images.decode_colour(image, Path("a")).astype(int))) <= 2
+    for image, named in (
+        (raw("rgb9", 4, red), "encoding: found rgb9"),
+        (raw("mono8", 3, red), "size, step: found 4x4 pixels in rows of 3 bytes"),
+        (raw("mono8", 5, red), "data: found 16 bytes, expected 4 rows of 5 bytes"),
+    ):
+        with pytest.raises(FormatError, match=named):
+            ros_images.decode_colour(image, Path("a"))
 
 
 # ---------------------------------------------------------------------------------------------- damaged, odd, hostile
@@ -425,28 +425,39 @@ def test_nothing_is_written_beside_a_database(tmp_path: Path) -> None:
     assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "bag").iterdir()} == before
 
 
-def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) -> None:
-    lz4 = pytest.importorskip("lz4.frame")
-    from dhtorch.data.codecs.bag_messages import decompress_chunk  # noqa: PLC0415
+@pytest.mark.parametrize(
+    ("size", "compression", "named"),
+    [
+        (1000, "lz4", "chunk: found 1001 bytes, expected 1000 bytes of lz4 data"),
+        (1000, "zstd", "chunk: found 1001 bytes, expected 1000 bytes of zstd data"),
+        (1000, "bz2", "chunk: found 1001 bytes, expected 1000 bytes of bz2 data"),
+        (1_000_001, "lz4", "chunk: found 1000000 bytes, expected 1000001"),
+        (1 << 29, "lz4", "chunk"),
+        (-1, "lz4", "chunk size"),
+        (10, "snappy", "compression: found snappy"),
+    ],
+)
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
+    tmp_path: Path, size: int, compression: str, named: str
+) -> None:
+    zeros = b"\0" * 1_000_000
+    packers = {
+        "lz4": lz4.frame.compress,
+        "bz2": bz2.compress,
+        "zstd": import_optional("compression.zstd", "backports.zstd").compress,
+    }
+    packed = packers.get(compression, bytes)(zeros)
+    if compression in packers:
+        assert bags.decompress_chunk(packed, compression, 1_000_000, tmp_path) == zeros
+    with pytest.raises(FormatError, match=named):
+        bags.decompress_chunk(packed, compression, size, tmp_path)
 
-    packed = lz4.compress(b"\0" * 1_000_000)
-    assert len(decompress_chunk(packed, "lz4", 1_000_000, tmp_path)) == 1_000_000
-    with pytest.raises(FormatError, match="chunk: found 1001 bytes, expected 1000 bytes of lz4 data"):
-        decompress_chunk(packed, "lz4", 1000, tmp_path)
-    with pytest.raises(FormatError, match="chunk"):
-        decompress_chunk(b"\0" * 40, "lz4", 1 << 29, tmp_path)
-    with pytest.raises(FormatError, match="compression: found snappy"):
-        decompress_chunk(b"", "snappy", 10, tmp_path)
 
+def test_topics_of_other_types_are_named_by_type(tmp_path: Path) -> None:
+    def begin(bag: BagWriter) -> None:
+        for _ in range(2):
+            bag.write("/joy", "std_msgs/msg/Float32", 100.0, {"data": 1.0})
 
-def test_topics_of_other_types_are_named_by_type_or_coding() -> None:
-    bag = rosbag_index.BagIndex(Path("a.bag"))
-    for name, kind, coding in (
-        ("/joy", "sensor_msgs/Joy", "ros1"),
-        ("/joy", "sensor_msgs/Joy", "ros1"),
-        ("/x", "", "json"),
-    ):
-        message: Any = SimpleNamespace(topic=SimpleNamespace(name=name, type=kind, coding=coding))
-        rosbag_index._add_message(bag, message)
-    assert bag.others == {"/joy (sensor_msgs/Joy)": 2, "/x (json)": 1}
-    assert bag.format_topics() == "/joy (sensor_msgs/Joy), /x (json)"
+    write_rosbag(tmp_path / "a.bag", [], BagLayout("ros1"), begin=begin)
+    with pytest.raises(FormatError, match=r"colour topic: found /joy \(std_msgs/Float32\), expected"):
+        data.open(tmp_path / "a.bag")

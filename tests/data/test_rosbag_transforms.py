@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dhtorch.data.codecs.ros_messages import Transform
 from dhtorch.data.readers import rosbag_transforms
-from dhtorch.data.readers.rosbag_transforms import TransformTree
+from dhtorch.data.readers.rosbag_transforms import Transform, TransformTree
 
 BAG = Path("a.bag")
 S = 1_000_000_000

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from dhtorch.data.codecs.ros_messages import CameraInfo, RawImage
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError, convert_colour, decode_depth_png, to_metres
 
 #: Encoding of depth → type of its pixels.
@@ -38,8 +37,8 @@ _GRID: Final = 41  # points along each side of the image at which an inverse len
 _MAX_INVERSION_PX: Final = 0.1  # px, largest error of an inverted model
 
 
-def decode_colour(image: RawImage, file: Path) -> np.ndarray:
-    """Picture (C, H, W) uint8, RGB or grey.
+def decode_colour(image: Any, file: Path) -> np.ndarray:
+    """Image (C, H, W) uint8, RGB or grey, of a message.
 
     Raises:
         FormatError: an unknown encoding, or fewer bytes than pixels.
@@ -52,7 +51,7 @@ def decode_colour(image: RawImage, file: Path) -> np.ndarray:
     return pixels.transpose(2, 0, 1).copy()
 
 
-def decode_depth(image: RawImage, metres: float, file: Path) -> np.ndarray:
+def decode_depth(image: Any, metres: float, file: Path) -> np.ndarray:
     """Depth (h, w) float32 in m; 0 = no return.
 
     Args:
@@ -65,7 +64,7 @@ def decode_depth(image: RawImage, metres: float, file: Path) -> np.ndarray:
     """
     if image.encoding not in DEPTH_ENCODINGS:
         raise FormatError(file, "encoding", image.encoding, ", ".join(DEPTH_ENCODINGS))
-    kind = np.dtype((">" if image.is_big_endian else "<") + DEPTH_ENCODINGS[image.encoding])
+    kind = np.dtype((">" if image.is_bigendian else "<") + DEPTH_ENCODINGS[image.encoding])
     pixels = _rows(image, kind, 1, file)[..., 0]
     if kind.kind == "u":
         return to_metres(pixels, 1 / metres)
@@ -104,25 +103,25 @@ def decode_compressed_depth(data: bytes, encoding: str, metres: float, hw: tuple
     return _clean(depth.astype(np.float32) * np.float32(metres))
 
 
-def to_opencv_distortion(info: CameraInfo, file: Path) -> list[float] | None:
+def to_opencv_distortion(info: Any, file: Path) -> list[float] | None:
     """Coefficients in OpenCV's order; None for a lens without distortion.
 
     Raises:
         FormatError: a model that is not OpenCV's, such as a fisheye.
     """
-    D = list(info.D)
+    D = np.asarray(info.d).tolist()
     if not any(D):
         return None
-    model = info.model.strip().lower().replace(" ", "_")
+    model = info.distortion_model.strip().lower().replace(" ", "_")
     if model == "inverse_brown_conrady":
         return _invert_brown_conrady(D, info, file)
     if model not in _OPENCV_MODELS or len(D) < 4:
         expected = f"{', '.join(_OPENCV_MODELS)}, or pictures rectified beforehand"
-        raise FormatError(file, "distortion_model", f"{info.model} of {len(D)} numbers", expected)
+        raise FormatError(file, "distortion_model", f"{info.distortion_model} of {len(D)} numbers", expected)
     return D[: 8 if len(D) >= 8 else min(len(D), 5)]
 
 
-def _invert_brown_conrady(D: list[float], info: CameraInfo, file: Path) -> list[float]:
+def _invert_brown_conrady(D: list[float], info: Any, file: Path) -> list[float]:
     """Coefficients of the lens whose *inverse* has the stated ones, by least squares over the image.
 
     The stated model maps distorted to ideal coordinates; with the pairs known, the wanted one is linear in its
@@ -130,14 +129,13 @@ def _invert_brown_conrady(D: list[float], info: CameraInfo, file: Path) -> list[
     """
     if len(D) < 5:
         raise FormatError(file, "D", f"{len(D)} numbers", "5: k1 k2 p1 p2 k3")
-    h, w = info.hw
-    u, v = np.meshgrid(np.linspace(0, w - 1, _GRID), np.linspace(0, h - 1, _GRID))
-    x, y = (u - info.K[0, 2]) / info.K[0, 0], (v - info.K[1, 2]) / info.K[1, 1]
+    u, v = np.meshgrid(np.linspace(0, info.width - 1, _GRID), np.linspace(0, info.height - 1, _GRID))
+    x, y = (u - info.k[2]) / info.k[0], (v - info.k[5]) / info.k[4]
     distorted = np.stack((x, y), -1).reshape(-1, 2)
     ideal = distorted + np.tensordot(_brown_conrady_terms(distorted), np.array(D[:5]), 1)
     terms, target = _brown_conrady_terms(ideal).reshape(-1, 5), (distorted - ideal).reshape(-1)
     coefficients = np.linalg.lstsq(terms, target, rcond=None)[0]
-    error = np.abs(terms @ coefficients - target).max() * info.K[0, 0]
+    error = np.abs(terms @ coefficients - target).max() * info.k[0]
     if not error <= _MAX_INVERSION_PX:
         raise FormatError(file, "D", f"a lens inverted to {error:.2g} px", f"at most {_MAX_INVERSION_PX} px")
     return [float(c) for c in coefficients]
@@ -152,16 +150,16 @@ def _brown_conrady_terms(xy: np.ndarray) -> np.ndarray:
     return np.stack((np.stack(along, -1), np.stack(down, -1)), 1)
 
 
-def _rows(image: RawImage, kind: np.dtype, channels: int, file: Path) -> np.ndarray:
+def _rows(image: Any, kind: np.dtype, channels: int, file: Path) -> np.ndarray:
     """Pixels (h, w, channels) without the padding of the rows."""
-    (h, w), size = image.hw, kind.itemsize * channels
-    used = w * size
+    h, w = image.height, image.width
+    used = w * kind.itemsize * channels
     if not 0 < h * w <= MAX_PIXELS or image.step < used:
         problem = f"{w}x{h} pixels in rows of {image.step} bytes"
         raise FormatError(file, "size, step", problem, f"1 to {MAX_PIXELS} pixels, {used} bytes or more in a row")
     if len(image.data) < (h - 1) * image.step + used:
         raise FormatError(file, "data", f"{len(image.data)} bytes", f"{h} rows of {image.step} bytes")
-    data = np.frombuffer(image.data, np.uint8)
+    data = np.asarray(image.data)
     rows = np.lib.stride_tricks.as_strided(data, (h, used), (image.step, 1))
     return np.ascontiguousarray(rows).view(kind).reshape(h, w, channels)
 

@@ -17,29 +17,29 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.clocks import pair_stamps
-from dhtorch.data.codecs import ros_images, ros_messages
-from dhtorch.data.codecs.bag_messages import MessagePlace, Topic
+from dhtorch.data.codecs import ros_images
+from dhtorch.data.codecs.bags import BAG_SIGNATURES, MessagePlace, Topic, read_message, read_signature
+from dhtorch.data.codecs.ros_messages import parse_message
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.rosbag_cameras import TopicCamera, differ_in_size_alone, find_camera
 from dhtorch.data.readers.rosbag_index import (
-    BAG_SIGNATURES,
     BagIndex,
-    PictureStream,
+    ImageStream,
+    TopicCamera,
+    differ_in_size_alone,
+    find_camera,
     index_bag,
     list_bag_files,
-    read_message,
-    read_signature,
 )
 from dhtorch.data.readers.rosbag_transforms import WORLD_FRAMES
 from dhtorch.data.recording import Recording
@@ -48,8 +48,6 @@ from dhtorch.records import Camera, Frame, Pose
 
 #: Files of the format that are not read: ``metadata.yaml`` repeats what the others hold.
 UNUSED_FILES: Final = ("metadata.yaml",)
-
-_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 
 _REGISTERED: Final = re.compile(r"aligned_depth_to_|depth_registered|depth_to_(rgb|color)|registered")
 _NO_COLOUR: Final = re.compile(r"depth|infra|(^|[/_])ir([/_\d]|$)|confidence|disparity|label|mask|seg|debug|overlay")
@@ -65,11 +63,8 @@ def recognise(root: Path) -> str | None:
     if root.is_dir():
         has_metadata = (root / "metadata.yaml").is_file()
         return "metadata.yaml and the files of a ROS 2 bag" if has_metadata and list_bag_files(root) else None
-    if root.suffix.lower() not in _SUFFIXES or not root.is_file():
-        return None
-    return next(
-        (what for signature, what in BAG_SIGNATURES.items() if read_signature(root).startswith(signature)), None
-    )
+    is_bag = root.suffix.lower() in (".mcap", ".db3", ".bag") and root.is_file()
+    return BAG_SIGNATURES.get(read_signature(root)) if is_bag else None
 
 
 def read(
@@ -96,7 +91,6 @@ def read(
 
     Raises:
         FormatError: no pictures with depth, no K, an unknown topic or encoding, or a damaged file.
-        ImportError: the decoder of the bag's chunks is not installed.
     """
     root = Path(root)
     parts = list_bag_files(root) if root.is_dir() else [root]
@@ -119,8 +113,8 @@ def read(
 
 
 class _Pair(NamedTuple):
-    colour: PictureStream
-    depth: PictureStream
+    colour: ImageStream
+    depth: ImageStream
     registered: bool  # by frame or name
 
 
@@ -129,52 +123,42 @@ class _Pair(NamedTuple):
 
 def _choose_pairs(bag: BagIndex, color: str | None, depth: str | None) -> list[_Pair]:
     """Colour topics with their depth, the best first; one for each colour camera."""
-    colours = _candidates(bag, color, is_depth=False)
-    depths = _candidates(bag, depth, is_depth=True)
+    colours, depths = _candidates(bag, color, "colour"), _candidates(bag, depth, "depth")
     if not colours or not depths:
         missing = "colour" if not colours else "depth"
         raise FormatError(bag.root, f"{missing} topic", bag.format_topics(), "sensor_msgs/Image or CompressedImage")
-    scored = sorted(
-        ((_score(bag, a, b), a, b) for a in colours for b in depths), key=lambda entry: entry[0], reverse=True
-    )
+    scored = sorted(((_score(a, b), a, b) for a in colours for b in depths), key=lambda entry: entry[0], reverse=True)
     pairs: list[_Pair] = []
     for score, a, b in scored:
         is_new = all(a.base != pair.colour.base and b.base != pair.depth.base for pair in pairs)
         # A further camera has a frame and a place in the names of its own.
-        if not pairs or (is_new and score[:2] == scored[0][0][:2] and _camera_name(a) not in map(_camera_of, pairs)):
+        names = [_camera_name(pair.colour) for pair in pairs]
+        if not pairs or (is_new and score[:2] == scored[0][0][:2] and _camera_name(a) not in names):
             pairs.append(_Pair(a, b, bool(score[0])))
     return pairs
 
 
-def _candidates(bag: BagIndex, name: str | None, *, is_depth: bool) -> list[PictureStream]:
+def _candidates(bag: BagIndex, name: str | None, kind: str) -> list[ImageStream]:
     if name is not None:
-        option = "depth" if is_depth else "color"
+        option = f"option {'color' if kind == 'colour' else kind}"
         if name not in bag.streams:
-            raise FormatError(bag.root, f"option {option}", name, f"one of {bag.format_topics()}")
+            raise FormatError(bag.root, option, name, f"one of {bag.format_topics()}")
         stream = bag.streams[name]
-        if stream.head is None or stream.head.is_depth != is_depth:
+        if stream.kind != kind:
             actual = f"{name} of encoding {stream.encoding}"
-            raise FormatError(bag.root, f"option {option}", actual, f"pictures of {option}")
+            raise FormatError(bag.root, option, actual, f"pictures of {option.removeprefix('option ')}")
         return [stream]
-    streams = [s for s in bag.streams.values() if s.head is not None and s.head.is_depth == is_depth]
-    if is_depth:
-        return streams
-    return [s for s in streams if not _NO_COLOUR.search(s.base.lower())] or streams
+    streams = [s for s in bag.streams.values() if s.kind == kind]
+    return [s for s in streams if kind == "depth" or not _NO_COLOUR.search(s.base.lower())] or streams
 
 
-def _score(bag: BagIndex, colour: PictureStream, depth: PictureStream) -> tuple[float, ...]:
+def _score(colour: ImageStream, depth: ImageStream) -> tuple[float, ...]:
     """Preference for a pair: registered, near by name, colour, not compressed, many frames."""
-    assert colour.head is not None
-    names = [stream.base.strip("/").split("/") for stream in (colour, depth)]
-    shared = 0
-    for a, b in zip(*(parts[:-1] for parts in names), strict=False):
-        if a != b:
-            break
-        shared += 1
+    folders = [stream.base.strip("/").split("/")[:-1] for stream in (colour, depth)]
     return (
         float(_is_registered(colour, depth)),
-        float(shared),
-        float(colour.head.channels >= 3),
+        float(sum(1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(*folders, strict=False)))),
+        float(colour.channels >= 3),
         float(bool(_COLOUR.search(colour.base.lower()))),
         float(not depth.compressed),
         float(not colour.compressed),
@@ -182,23 +166,17 @@ def _score(bag: BagIndex, colour: PictureStream, depth: PictureStream) -> tuple[
     )
 
 
-def _is_registered(colour: PictureStream, depth: PictureStream) -> bool:
+def _is_registered(colour: ImageStream, depth: ImageStream) -> bool:
     """Whether the depth is of the colour's frame; where frames are not named, whether its topic is called so."""
-    assert colour.head is not None and depth.head is not None
-    frames = [head.frame.lstrip("/") for head in (colour.head, depth.head)]
+    frames = [stream.frame.lstrip("/") for stream in (colour, depth)]
     if all(frames) and _SDK_IMAGE.fullmatch(depth.base) is None:  # the SDK's frames are numbers
         return frames[0] == frames[1]
     return _REGISTERED.search(depth.base.lower()) is not None
 
 
-def _camera_name(stream: PictureStream) -> str:
+def _camera_name(stream: ImageStream) -> str:
     """Frame of a camera, or the folder of its topic where it has no frame."""
-    frame = stream.head.frame if stream.head is not None else ""
-    return frame or stream.base.rpartition("/")[0]
-
-
-def _camera_of(pair: _Pair) -> str:
-    return _camera_name(pair.colour)
+    return stream.frame or stream.base.rpartition("/")[0]
 
 
 # ------------------------------------------------------------------------------------------------------------ opening
@@ -212,8 +190,7 @@ def _open_pair(
     use_poses: bool,
 ) -> Recording:
     colour, depth = pair.colour, pair.depth
-    assert colour.head is not None and depth.head is not None
-    hw, depth_hw = colour.head.hw, depth.head.hw
+    hw, depth_hw = colour.hw, depth.hw
     option = intrinsics_options.parse_intrinsics(bag.root, hw, *K_options)
     if option.feature is not None:
         raise FormatError(bag.root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
@@ -267,8 +244,7 @@ def _relate(
     bag: BagIndex, pair: _Pair, camera: Camera, depth_eye: TopicCamera | None
 ) -> tuple[Camera | None, Pose | None, list[str]]:
     """(camera of the depth or None where it is the colour's, T_colour_from_depth or None, remarks)."""
-    assert pair.colour.head is not None and pair.depth.head is not None
-    hw, depth_hw = pair.colour.head.hw, pair.depth.head.hw
+    hw, depth_hw = pair.colour.hw, pair.depth.hw
     if depth_eye is None:
         if pair.registered or hw == depth_hw:
             remark = f"{pair.depth.topic.name} has no CameraInfo: taken as registered to {pair.colour.topic.name}"
@@ -300,41 +276,38 @@ def _find_extrinsics(bag: BagIndex, pair: _Pair) -> np.ndarray | None:
         stated[0].keys() & stated[1].keys()
     ):  # transforms map points of the reference to the stream
         return stated[0][reference] @ np.linalg.inv(stated[1][reference])
-    assert pair.colour.head is not None and pair.depth.head is not None
-    if not pair.colour.head.frame or not pair.depth.head.frame:
+    if not pair.colour.frame or not pair.depth.frame:
         return None
-    return bag.tree.fixed_transform(pair.colour.head.frame, pair.depth.head.frame)
+    return bag.tree.fixed_transform(pair.colour.frame, pair.depth.frame)
 
 
-def _depth_unit(bag: BagIndex, depth: PictureStream) -> DepthUnit | None:
-    assert depth.head is not None
+def _depth_unit(bag: BagIndex, depth: ImageStream) -> DepthUnit | None:
     if match := _SDK_IMAGE.fullmatch(depth.base):
         for name, metres in bag.sdk_units.items():
             if name.startswith(f"{match[1]}/option/"):
                 return DepthUnit(files.to_positive(metres, bag.root, name), name)
-    encoding = depth.head.encoding.partition(";")[0].strip()
+    encoding = depth.encoding.partition(";")[0].strip()
     if encoding == "32FC1":
         return None
     return DepthUnit(_MILLIMETRE, "REP 118: 16UC1" if encoding == "16UC1" else None)
 
 
 def _find_poses(
-    bag: BagIndex, colour: PictureStream, times_ns: np.ndarray, pairs: np.ndarray, use_poses: bool
+    bag: BagIndex, colour: ImageStream, times_ns: np.ndarray, pairs: np.ndarray, use_poses: bool
 ) -> tuple[np.ndarray | None, np.ndarray, list[str]]:
     """(camera-to-world of the kept pairs or None, kept pairs, remarks)."""
-    assert colour.head is not None
-    if not use_poses or not colour.head.frame:
+    if not use_poses or not colour.frame:
         return None, pairs, []
     if not bag.tree.is_whole:
         return None, pairs, [f"{bag.tree.count} transforms are too many to read: no poses"]
-    trajectory = bag.tree.poses(colour.head.frame, times_ns[pairs[:, 0]], bag.root)
+    trajectory = bag.tree.poses(colour.frame, times_ns[pairs[:, 0]], bag.root)
     if trajectory is None:
         return None, pairs, []
     c2w, covered, world = trajectory
     if covered.mean() < _MIN_POSED_SHARE:
-        remark = f"transforms of {colour.head.frame} cover {int(covered.sum())} of {len(covered)} frames: no poses"
+        remark = f"transforms of {colour.frame} cover {int(covered.sum())} of {len(covered)} frames: no poses"
         return None, pairs, [remark]
-    report = files.format_left_out(pairs[~covered, 0].tolist(), f"no transform of {colour.head.frame} at its time")
+    report = files.format_left_out(pairs[~covered, 0].tolist(), f"no transform of {colour.frame} at its time")
     if world not in WORLD_FRAMES:
         report.append(f"poses are relative to the frame {world}: valid only while that is stationary")
     return c2w[covered], pairs[covered], report
@@ -360,22 +333,20 @@ class _Load:
         depth = torch.from_numpy(self._decode(self.depths[i], 1, self.depth_hw))
         depth_camera = self.depth_camera
         if depth_camera is not None and self.T_colour_from_depth is not None:
-            depth, depth_camera = self._register(depth, depth_camera, self.T_colour_from_depth), None
+            # Depth of the colour camera at the density of the depth camera.
+            T = self.T_colour_from_depth.to(depth.dtype)
+            depth, depth_camera = convert.register_depth(depth, depth_camera, self.camera, self.hw, T), None
         return Frame(torch.from_numpy(image)[None], depth[None], self.camera, depth_camera)
 
     def _decode(self, place: MessagePlace, k: int, hw: tuple[int, int]) -> np.ndarray:
         topic, data = self.codings[k], read_message(place)
         where = Path(f"{place.file}{topic.name}")
         if self.compressed[k]:
-            encoding, content = ros_messages.parse_compressed_image(data, topic.coding, where)
+            packed = parse_message(data, "CompressedImage", topic.coding, where)
             if k == 0:
-                return files.decode_image(bytes(content), where, hw)
-            return ros_images.decode_compressed_depth(bytes(content), encoding, self.metres, hw, where)
-        image = ros_messages.parse_image(data, topic.coding, where)
-        if image.hw != hw:
-            raise FormatError(where, "size", f"{image.hw[1]}x{image.hw[0]}", f"{hw[1]}x{hw[0]}")
+                return files.decode_image(bytes(packed.data), where, hw)
+            return ros_images.decode_compressed_depth(bytes(packed.data), packed.format, self.metres, hw, where)
+        image = parse_message(data, "Image", topic.coding, where)
+        if (image.height, image.width) != hw:
+            raise FormatError(where, "size", f"{image.width}x{image.height}", f"{hw[1]}x{hw[0]}")
         return ros_images.decode_depth(image, self.metres, where) if k else ros_images.decode_colour(image, where)
-
-    def _register(self, depth: Tensor, depth_camera: Camera, T: Pose) -> Tensor:
-        """Depth of the colour camera at the density of the depth camera."""
-        return convert.register_depth(depth, depth_camera, self.camera, self.hw, T.to(depth.dtype))

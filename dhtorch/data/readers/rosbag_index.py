@@ -1,63 +1,45 @@
-"""Index of a robot's recording: the topics of pictures, their stamps and places, calibrations and transforms."""
+"""Index of a robot's recording: the topics of images, their stamps and places, calibrations, cameras and transforms."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+import torch
 
 from dhtorch.data import convert
-from dhtorch.data.codecs import mcap, ros_images, ros_messages, rosbag1, rosbag_database
-from dhtorch.data.codecs.bag_messages import (
-    HEAD_BYTES,
-    IndexedMessage,
-    MessagePlace,
-    Topic,
-    check_message_count,
-)
+from dhtorch.data.codecs import ros_images
+from dhtorch.data.codecs.bags import HEAD_BYTES, IndexedMessage, MessagePlace, Topic, iter_messages, read_message
+from dhtorch.data.codecs.ros_messages import parse_message, stamp_ns
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.rosbag_transforms import TransformTree
-from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
+from dhtorch.data.readers.rosbag_transforms import Transform, TransformTree
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Camera
+from dhtorch.runtime.safe_open import check_memory
 
 _IMAGE_TYPES: Final = {"sensor_msgs/Image": False, "sensor_msgs/CompressedImage": True}  # type → whether compressed
-_CODINGS: Final = ("cdr", "ros1")
-_TRANSPORTS: Final = ("compressed", "compressedDepth")  # last parts of the names of compressed topics
 _NO_DEPTH: Final = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|confidence|disparity|amplitude|label|mask|seg")
 _MAX_NAMES_SHOWN: Final = 12  # topics in a message
-_MESSAGES_PER_CHECK: Final = 4096  # between two checks of the memory that the index takes
-
-#: First bytes of a file → what it is.
-BAG_SIGNATURES: Final = {
-    mcap.MCAP_SIGNATURE: "an MCAP file",
-    rosbag1.BAG_SIGNATURE: "a ROS 1 bag",
-    rosbag_database.SQLITE_SIGNATURE: "a ROS 2 bag in SQLite",
-}
-
-
-class PictureHead(NamedTuple):
-    """Properties of a stream of pictures, from its first message."""
-
-    frame: str
-    hw: tuple[int, int]
-    encoding: str
-    is_depth: bool
-    channels: int
+_MESSAGE_BYTES: Final = 300  # memory of a reference and its stamp
 
 
 @dataclass(eq=False)
-class PictureStream:
-    """Messages of a topic of pictures."""
+class ImageStream:
+    """Messages of a topic of images, and what its first message says of them."""
 
     topic: Topic
     compressed: bool
-    encoding: str = ""
-    head: PictureHead | None = None  # None: neither colour nor depth
+    frame: str
+    encoding: str
+    kind: Literal["colour", "depth", ""] = ""  # neither of the two
+    hw: tuple[int, int] = (0, 0)
+    channels: int = 3
     stamps_ns: list[int] = field(default_factory=list)
     recorded_ns: list[int] = field(default_factory=list)
     places: list[MessagePlace] = field(default_factory=list)
@@ -66,7 +48,7 @@ class PictureStream:
     def base(self) -> str:
         """Name of the topic without that of its compression."""
         parent, _, last = self.topic.name.rpartition("/")
-        return parent if last in _TRANSPORTS else self.topic.name
+        return parent if last in ("compressed", "compressedDepth") else self.topic.name
 
 
 @dataclass(eq=False)
@@ -74,17 +56,16 @@ class BagIndex:
     """Index of a bag."""
 
     root: Path
-    streams: dict[str, PictureStream] = field(default_factory=dict)
-    infos: dict[str, ros_messages.CameraInfo] = field(default_factory=dict)  # by topic, the first of each
+    streams: dict[str, ImageStream] = field(default_factory=dict)
+    infos: dict[str, Any] = field(default_factory=dict)  # CameraInfo by topic, the first of each
     tree: TransformTree = field(default_factory=TransformTree)
     sdk_transforms: dict[str, np.ndarray] = field(default_factory=dict)  # topic → T_stream_from_reference
     sdk_units: dict[str, float] = field(default_factory=dict)  # topic → m
     others: Counter[str] = field(default_factory=Counter)  # topics of other types or codings
 
     def format_topics(self) -> str:
-        """The topics of pictures, or the others where there are none, as text."""
-        names = [f"{s.topic.name} ({s.head.encoding if s.head else s.encoding})" for s in self.streams.values()]
-        names = names or list(self.others)
+        """The topics of images, or the others where there are none, as text."""
+        names = [f"{s.topic.name} ({s.encoding})" for s in self.streams.values()] or list(self.others)
         return ", ".join(names[:_MAX_NAMES_SHOWN]) + (" …" if len(names) > _MAX_NAMES_SHOWN else "") or "no topic"
 
 
@@ -93,132 +74,143 @@ def list_bag_files(root: Path) -> list[Path]:
     return sorted((file for file in root.iterdir() if file.suffix in (".db3", ".mcap")), key=files.natural_sort_key)
 
 
-def read_signature(file: Path) -> bytes:
-    """First bytes of a file; empty where it cannot be read."""
-    try:
-        with open_regular(file) as stream:
-            return stream.read(16)
-    except (FormatError, OSError):
-        return b""
-
-
-def _iter_messages(file: Path) -> Iterator[IndexedMessage]:
-    head = read_signature(file)
-    if head.startswith(rosbag1.BAG_SIGNATURE):
-        return rosbag1.iter_bag_messages(file)
-    if head.startswith(rosbag_database.SQLITE_SIGNATURE):
-        return rosbag_database.iter_database_messages(file)
-    return mcap.iter_mcap_messages(file)
-
-
-def read_message(place: MessagePlace) -> bytes:
-    """All bytes of a message."""
-    if place.chunk == rosbag_database.DATABASE_ROW:
-        return rosbag_database.read_database_message(place)
-    if not 0 <= place.length <= MAX_FILE_BYTES:
-        raise FormatError(place.file, "message", f"{place.length} bytes", f"at most {MAX_FILE_BYTES}")
-    if place.chunk >= 0:
-        is_mcap = read_signature(place.file).startswith(mcap.MCAP_SIGNATURE)
-        content = (mcap.read_mcap_chunk if is_mcap else rosbag1.read_bag_chunk)(place.file, place.chunk)
-        return content[place.start : place.start + place.length]
-    with open_regular(place.file) as stream:
-        stream.seek(place.start)
-        return stream.read(place.length)
-
-
 def index_bag(root: Path, parts: Sequence[Path]) -> BagIndex:
     """Index of the messages of all files of a bag; pixels are not decoded.
 
     Raises:
         FormatError: a damaged file, or more messages than the memory limit allows.
-        ImportError: the decoder of the bag's chunks is not installed.
     """
     bag = BagIndex(root)
     count = 0
     for file in parts:
-        for message in _iter_messages(file):
+        for message in iter_messages(file):
             count += 1
-            if count % _MESSAGES_PER_CHECK == 0:
-                check_message_count(file, count)
+            if count % 4096 == 0:
+                check_memory(file, "messages", _MESSAGE_BYTES * count, f"{count} messages")
             _add_message(bag, message)
-    for stream in bag.streams.values():
-        _set_stamps(stream)
+    for stream in bag.streams.values():  # in the order of the stamps; those never set are the times of recording
+        stamps = np.array(stream.stamps_ns if any(stream.stamps_ns) else stream.recorded_ns, np.int64)
+        order = np.argsort(stamps, kind="stable")
+        stream.stamps_ns = stamps[order].tolist()
+        stream.places = [stream.places[i] for i in order]
     return bag
 
 
 def _add_message(bag: BagIndex, message: IndexedMessage) -> None:
-    topic = message.topic
-    kind = topic.type if topic.coding in _CODINGS else ""
+    topic, place = message.topic, message.place
+    kind = topic.type if topic.coding in ("cdr", "ros1") else ""
+    name = kind.rpartition("/")[2]
+
+    def parse() -> Any:
+        data = message.head if place.length <= HEAD_BYTES else read_message(place)
+        return parse_message(data, name, topic.coding, place.file)
+
     if kind in _IMAGE_TYPES:
-        _add_picture(bag, message)
+        definition = "CompressedHead" if _IMAGE_TYPES[kind] else "ImageHead"
+        head = parse_message(message.head, definition, topic.coding, place.file)
+        if topic.name not in bag.streams:
+            bag.streams[topic.name] = _describe_stream(message, head, compressed=_IMAGE_TYPES[kind])
+        stream = bag.streams[topic.name]
+        stream.stamps_ns.append(stamp_ns(head.header))
+        stream.recorded_ns.append(message.time_ns)
+        stream.places.append(place)
     elif kind == "sensor_msgs/CameraInfo":
         if topic.name not in bag.infos:
-            bag.infos[topic.name] = ros_messages.parse_camera_info(*_whole(message))
-    elif kind in ("tf2_msgs/TFMessage", "tf/tfMessage"):
-        bag.tree.add(ros_messages.parse_transforms(*_whole(message)))
-    elif kind == "nav_msgs/Odometry":
-        bag.tree.add([ros_messages.parse_odometry(*_whole(message))])
+            bag.infos[topic.name] = parse()
+    elif kind in ("tf2_msgs/TFMessage", "tf/tfMessage", "nav_msgs/Odometry"):
+        name = name.replace("tfM", "TFM")
+        for each in [parse()] if name == "Odometry" else parse().transforms:
+            pose = each.translation.tolist(), each.rotation.tolist()
+            bag.tree.add([Transform(stamp_ns(each.header), each.header.frame_id, each.child_frame_id, *pose)])
     elif kind == "geometry_msgs/Transform" and "/tf/" in topic.name:
-        t, q = ros_messages.parse_plain_transform(*_whole(message))
-        matrix = convert.to_c2w(np.array([q]), np.array([t]), message.place.file, topic.name)[0]
+        T = parse()
+        matrix = convert.to_c2w(T.rotation[None], T.translation[None], place.file, topic.name)[0]
         bag.sdk_transforms.setdefault(topic.name, matrix)
     elif kind == "std_msgs/Float32" and re.search(r"/option/Depth[ _]Units/value$", topic.name):
-        bag.sdk_units.setdefault(topic.name, ros_messages.parse_float(*_whole(message)))
+        bag.sdk_units.setdefault(topic.name, float(parse().data))
     else:
         bag.others[f"{topic.name} ({topic.type or topic.coding})"] += 1
 
 
-def _whole(message: IndexedMessage) -> tuple[bytes, str, Path]:
-    """Arguments of a parser."""
-    data = message.head if message.place.length <= HEAD_BYTES else read_message(message.place)
-    return data, message.topic.coding, message.place.file
-
-
-def _add_picture(bag: BagIndex, message: IndexedMessage) -> None:
+def _describe_stream(message: IndexedMessage, head: Any, *, compressed: bool) -> ImageStream:
+    """The stream of a topic, from its first message."""
     topic, file = message.topic, message.place.file
-    stream = bag.streams.get(topic.name)
-    if stream is None:
-        stream = bag.streams[topic.name] = PictureStream(topic, _IMAGE_TYPES[topic.type])
-        stream.head = _describe_stream(stream, message)
-    stream.stamps_ns.append(ros_messages.parse_header(message.head, topic.coding, file).stamp_ns)
-    stream.recorded_ns.append(message.time_ns)
-    stream.places.append(message.place)
-
-
-def _describe_stream(stream: PictureStream, message: IndexedMessage) -> PictureHead | None:
-    """Kind of the pictures of a topic, from its first message; None for neither colour nor depth."""
-    topic, file = stream.topic, message.place.file
-    head = ros_messages.parse_image_head(message.head, topic.coding, file, compressed=stream.compressed)
+    full = head.format if compressed else head.encoding
+    encoding = full.partition(";")[0].strip()
+    stream = ImageStream(topic, compressed, head.header.frame_id, full)
     name = stream.base.lower()
-    stream.encoding = head.encoding
-    encoding = head.encoding.partition(";")[0].strip()
-    if stream.compressed:
-        is_depth = ros_images.is_compressed_depth(head.encoding, topic.name)
+    if compressed:
+        is_depth = ros_images.is_compressed_depth(full, topic.name)
     else:
         is_depth = encoding in ros_images.DEPTH_ENCODINGS and (encoding != "mono16" or "depth" in name)
-    if is_depth:
-        if _NO_DEPTH.search(name):
-            return None
-    elif not stream.compressed and encoding not in ros_images.COLOUR_CHANNELS:
-        return None
-    hw = head.hw
-    channels = ros_images.COLOUR_CHANNELS.get(encoding, 3)
-    if hw is None:
-        _, data = ros_messages.parse_compressed_image(read_message(message.place), topic.coding, file)
-        picture = ros_images.strip_depth_header(bytes(data), is_depth)
+    is_colour = not is_depth and (compressed or encoding in ros_images.COLOUR_CHANNELS)
+    if not is_colour and (not is_depth or _NO_DEPTH.search(name)):
+        return stream
+    stream.channels = ros_images.COLOUR_CHANNELS.get(encoding, 3)
+    if compressed:
+        whole = parse_message(read_message(message.place), "CompressedImage", topic.coding, file)
+        image = ros_images.strip_depth_header(bytes(whole.data), is_depth)
         try:
-            header = files.decode_image_header(picture, Path(f"{file}{topic.name}"))
+            header = files.decode_image_header(image, Path(f"{file}{topic.name}"))
         except FormatError:  # a video's packet, RVL
-            return None
-        hw, channels = header.hw, header.channels
-    return PictureHead(head.header.frame, hw, head.encoding, is_depth, channels)
+            return stream
+        stream.hw, stream.channels = header.hw, header.channels
+    else:
+        stream.hw = head.height, head.width
+    stream.kind = "depth" if is_depth else "colour"
+    return stream
 
 
-def _set_stamps(stream: PictureStream) -> None:
-    """Messages in the order of their stamps; stamps that were never set are replaced by the times of recording."""
-    stamps = np.array(stream.stamps_ns, np.int64)
-    if not stamps.any():
-        stamps = np.array(stream.recorded_ns, np.int64)
-    order = np.argsort(stamps, kind="stable")
-    stream.stamps_ns = stamps[order].tolist()
-    stream.places = [stream.places[i] for i in order]
+# ------------------------------------------------------------------------------------------------------------ cameras
+
+
+class TopicCamera(NamedTuple):
+    """Camera of a topic."""
+
+    camera: Camera
+    report: tuple[str, ...] = ()
+
+
+def find_camera(bag: BagIndex, stream: ImageStream) -> TopicCamera | None:
+    """Camera of a topic from the CameraInfo beside it, else from the only one of its frame; None without any."""
+    parent = stream.base.rpartition("/")[0]
+    names = [f"{parent}/camera_info", f"{stream.base}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info"]
+    name = next((name for name in names if name in bag.infos), None)
+    if name is None:
+        frame = stream.frame
+        of_frame = [n for n, info in bag.infos.items() if frame and info.header.frame_id == frame and info.k[0] > 0]
+        name = of_frame[0] if len(of_frame) == 1 else None
+    if name is None or not bag.infos[name].k[0] > 0:  # 0 = not calibrated
+        return None
+    info, where = bag.infos[name], Path(f"{bag.root}{name}")
+    is_rectified = "rect" in stream.base.rpartition("/")[2] and info.p[0] > 0
+    D = None if is_rectified else ros_images.to_opencv_distortion(info, where)
+    K, hw = crop_camera(info.p.reshape(3, 4)[:, :3] if is_rectified else info.k.reshape(3, 3), info)
+    report: tuple[str, ...] = ()
+    if hw != stream.hw:
+        h, w = stream.hw
+        if abs(w * hw[0] - h * hw[1]) > max(h, w):  # more than a pixel off the calibration's aspect
+            raise FormatError(where, "width, height", f"{hw[1]}x{hw[0]}", f"{w}x{h} as {stream.topic.name}")
+        K = convert.resize_K(K, hw, stream.hw)
+        report = (f"{stream.topic.name}: K of {hw[1]}x{hw[0]} pixels is scaled to {w}x{h}",)
+    return TopicCamera(convert.to_camera(K, stream.hw, where, "P" if is_rectified else "K", D), report)
+
+
+def crop_camera(K: np.ndarray, info: Any) -> tuple[np.ndarray, tuple[int, int]]:
+    """K and size of the region of interest of a CameraInfo after binning."""
+    h, w = info.roi_height or info.height, info.roi_width or info.width
+    K = K - np.array([[0, 0, info.x_offset], [0, 0, info.y_offset], [0, 0, 0]])
+    bx, by = max(1, info.binning_x), max(1, info.binning_y)
+    if (bx, by) == (1, 1):
+        return K, (h, w)
+    return convert.resize_K(K, (h, w), (h // by, w // bx)), (h // by, w // bx)
+
+
+def differ_in_size_alone(camera: Camera, hw: tuple[int, int], own: Camera, depth_hw: tuple[int, int]) -> bool:
+    """Whether two cameras differ in the size of their images alone."""
+    scaled = cameras.resize(camera, hw, depth_hw)
+    is_close = torch.allclose(scaled.f, own.f, rtol=1e-3) and torch.allclose(scaled.c, own.c, rtol=0, atol=0.51)
+    if camera.distortion is None or own.distortion is None:
+        return is_close  # a driver that registers depth may state no distortion of it
+    is_alike = camera.distortion.shape == own.distortion.shape and torch.allclose(camera.distortion, own.distortion)
+    return is_close and is_alike

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from dhtorch.data import convert
 from dhtorch.data.clocks import interpolate_poses
-from dhtorch.data.codecs.ros_messages import Transform
 
 #: Longest interval in s between two transforms to interpolate in: across longer ones tracking was lost.
 _MAX_GAP_S: Final = 0.5
@@ -23,6 +22,16 @@ _MAX_TRANSFORMS: Final = 500_000  # kept in memory; about two hours of a robot o
 _FIXED_M: Final = 1e-9  # largest difference of a repeated transform that is taken as fixed
 #: Roots that stand still by their convention (REP 105).
 WORLD_FRAMES: Final = ("map", "odom", "world", "earth")
+
+
+class Transform(NamedTuple):
+    """Pose of a child frame in its parent's."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    t: Sequence[float]  # m
+    q: Sequence[float]  # x y z w
 
 
 @dataclass

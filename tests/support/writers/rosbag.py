@@ -66,7 +66,7 @@ def write_rosbag(
     """
     layout = layout or BagLayout()
     is_ros1 = layout.storage == "ros1"
-    typesys = import_optional("rosbags.typesys", extra="dev")
+    typesys = import_optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE)
     if is_ros1:  # not in the library's store
         store.register(typesys.get_types_from_msg(_TF_DEFINITION, "tf2_msgs/msg/TFMessage"))
@@ -153,12 +153,12 @@ class BagWriter:
 def _open_writer(path: Path, layout: BagLayout) -> Any:
     path.parent.mkdir(parents=True, exist_ok=True)
     if layout.storage == "ros1":
-        library = import_optional("rosbags.rosbag1", extra="dev")
+        library = import_optional("rosbags.rosbag1")
         writer = library.Writer(path)
         if layout.compression:
             writer.set_compression(library.Writer.CompressionFormat[layout.compression.upper()])
         return writer
-    library = import_optional("rosbags.rosbag2", extra="dev")
+    library = import_optional("rosbags.rosbag2")
     return library.Writer(path, version=9, storage_plugin=library.StoragePlugin[layout.storage.upper()])
 
 
