@@ -23,56 +23,45 @@ def paired(pictures: Sequence[float] | np.ndarray, rows: Sequence[float] | np.nd
     return [pairing.picture.tolist() for pairing in pair_film(np.array(pictures), np.array(rows))]
 
 
-@pytest.mark.parametrize("rate", [30.0, 60.0, 24.0, 0.03])
-@pytest.mark.parametrize("start", [0.0, 86400.5])
-def test_gaps_of_a_film_show_which_rows_have_no_picture(rate: float, start: float) -> None:
-    assert paired(np.delete(np.arange(12) / rate, LOST), ROWS + start) == [GAP]
+NOISE = np.random.default_rng(0)
+PAUSED = [0, 1 / 15, 2 / 15, 1.2, 1.2 + 1 / 15, 1.2 + 2 / 15]
+#: Stamps of a film, those of the rows, and all pairings.
+PAIRED = [
+    *(
+        (np.delete(np.arange(12) / rate, LOST), ROWS + start, [GAP])  # gaps of a film show which rows have no image
+        for rate in (30.0, 60.0, 24.0, 0.03)
+        for start in (0.0, 86400.5)
+    ),
+    # A film of a fraction or a multiple of the rate is paired by its length.
+    (ROWS[::2], ROWS, [[0, -1, 1, -1, 2, -1, 3, -1, 4, -1, 5, -1]]),
+    (ROWS[::3], ROWS, [[0, -1, -1, 1, -1, -1, 2, -1, -1, 3, -1, -1]]),
+    (np.arange(24) / 60, ROWS, [list(range(0, 24, 2))]),
+    # As many images as rows are paired by their places, unless there are gaps elsewhere.
+    *(
+        (film, ROWS, [list(range(12))])
+        for film in (
+            ROWS, np.arange(12) / 60, ROWS + 0.01 * np.sin(np.arange(12)), np.sort(NOISE.uniform(0, 0.4, 12)),
+            np.zeros(12), np.full(12, np.nan),
+        )
+    ),
+    (np.delete(ROWS, [8, 9]), np.delete(ROWS, [3, 4]), [[0, 1, 2, 5, 6, 7, -1, -1, 8, 9]]),
+    (np.arange(6) / 60, PAUSED, [list(range(6))]),  # a pause of the table does not shift a film that counts on
+    ([0, 0, 0], [0, 0, 0, 0, 0], [[0, 1, 2, -1, -1], [-1, -1, 0, 1, 2]]),  # the first or the last are lost
+]  # fmt: skip
 
 
-def test_a_film_of_a_fraction_or_a_multiple_of_the_rate_is_paired_by_its_length() -> None:
-    assert paired(ROWS[::2]) == [[0, -1, 1, -1, 2, -1, 3, -1, 4, -1, 5, -1]]
-    assert paired(ROWS[::3]) == [[0, -1, -1, 1, -1, -1, 2, -1, -1, 3, -1, -1]]
-    assert paired(np.arange(24) / 60) == [list(range(0, 24, 2))]
+@pytest.mark.parametrize(("film", "rows", "pairings"), PAIRED)
+def test_images_of_a_film_are_paired_with_rows(film: np.ndarray, rows: np.ndarray, pairings: list[list[int]]) -> None:
+    assert paired(film, rows) == pairings
 
 
 def test_a_short_film_of_constant_rate_may_start_at_any_row() -> None:
     candidates = paired(ROWS[:9])
     assert candidates[0] == [*range(9), -1, -1, -1] and candidates[-1] == [-1, -1, -1, *range(9)]
     assert len(paired(ROWS[:6])) == 7  # a nominal rate and the first half, or the whole at half the rate: not known
-
-
-def test_a_few_pictures_or_rows_start_within_both() -> None:
+    assert len(paired(np.delete(ROWS, [4, 5, 11]))) == 2  # a gap and a lost end
     for n, m in ((4, 3), (3, 4), (2, 12), (12, 2)):
-        for candidate in paired(ROWS[:m] * 1.3, ROWS[:n]):
-            assert len(candidate) == n and max(candidate) < m
-
-
-def test_a_gap_and_a_lost_end_fit_twice() -> None:
-    assert len(paired(np.delete(ROWS, [4, 5, 11]))) == 2
-
-
-@pytest.mark.parametrize(
-    "pictures",
-    [
-        ROWS,
-        np.arange(12) / 60,
-        ROWS + 0.01 * np.sin(np.arange(12)),
-        np.sort(np.random.default_rng(0).uniform(0, 0.4, 12)),
-        np.zeros(12),
-        np.full(12, np.nan),
-    ],
-)
-def test_as_many_pictures_as_rows_are_paired_by_their_places(pictures: np.ndarray) -> None:
-    assert paired(pictures) == [list(range(12))]
-
-
-def test_as_many_pictures_as_rows_with_gaps_elsewhere_are_paired_by_stamps() -> None:
-    assert paired(np.delete(ROWS, [8, 9]), np.delete(ROWS, [3, 4])) == [[0, 1, 2, 5, 6, 7, -1, -1, 8, 9]]
-
-
-def test_a_pause_of_the_table_does_not_shift_a_film_that_counts_on() -> None:
-    rows = [0, 1 / 15, 2 / 15, 1.2, 1.2 + 1 / 15, 1.2 + 2 / 15]
-    assert paired(np.arange(6) / 60, rows) == [list(range(6))]
+        assert all(len(each) == n and max(each) < m for each in paired(ROWS[:m] * 1.3, ROWS[:n]))
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.001])
@@ -85,10 +74,6 @@ def test_clocks_may_drift_and_jitter(jitter: float, drift: float) -> None:
     found = np.array(pairing)
     assert (found[kept] == np.arange(len(kept))).mean() > 0.99
     assert (found[[500, 501, 1400]] == -1).all()
-
-
-def test_without_stamps_the_first_or_the_last_pictures_are_lost() -> None:
-    assert paired([0, 0, 0], [0, 0, 0, 0, 0]) == [[0, 1, 2, -1, -1], [-1, -1, 0, 1, 2]]
 
 
 @pytest.mark.parametrize(
@@ -117,11 +102,17 @@ def test_every_recording_reports_its_rate() -> None:
     assert wrong.report[-1] == "time stamps are likely in milliseconds: frames follow at 0.03 Hz"
 
 
-def test_numbers_as_text() -> None:
-    assert format_numbers([0], "row") == "row 0"
-    assert format_numbers([4, 5, 6], "row") == "rows 4, 5, 6"
-    assert format_numbers([1, 3, 4, 5, 6, 9], "row") == "rows 1, 3 to 6, 9"
-    assert format_numbers(range(1, 21, 2), "row") == "rows 1, 3, 5, 7, 9, 11 and 4 more"
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [
+        ([0], "row 0"),
+        ([4, 5, 6], "rows 4, 5, 6"),
+        ([1, 3, 4, 5, 6, 9], "rows 1, 3 to 6, 9"),
+        (range(1, 21, 2), "rows 1, 3, 5, 7, 9, 11 and 4 more"),
+    ],
+)
+def test_numbers_as_text(numbers: Sequence[int], text: str) -> None:
+    assert format_numbers(numbers, "row") == text
 
 
 def turned(degrees: Sequence[float]) -> np.ndarray:

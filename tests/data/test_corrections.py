@@ -50,25 +50,12 @@ def test_stated_poses_are_taken_back(convention, write, frames, tmp_path):
     assert torch.equal(corrected[1].T_world_from_cam.t, corrected.poses.t[1:2])
 
 
-@pytest.mark.parametrize("unit", ["1/5000", "inch", 0.004])
-def test_a_unit_is_applied_to_the_stored_steps(unit, folder):
-    (as_read,) = data.open_all(folder)
-    (corrected,) = data.open_all(folder, depth_unit=unit)
-    metres = {"1/5000": 1 / 5000, "inch": 0.0254, 0.004: 0.004}[unit]
+@pytest.mark.parametrize(("unit", "metres"), [("1/5000", 1 / 5000), ("inch", 0.0254), (0.004, 0.004), ("mm", 0.001)])
+def test_a_unit_is_applied_to_the_stored_steps(unit, metres, folder):
+    (as_read,), (corrected,) = data.open_all(folder), data.open_all(folder, depth_unit=unit)
     assert as_read.depth_unit == DepthUnit(0.001) and corrected.depth_unit == DepthUnit(metres, "option depth_unit")
     torch.testing.assert_close(corrected[2].depth, as_read[2].depth * metres / 0.001)
     assert torch.equal(corrected[2].image, as_read[2].image)
-
-
-def test_the_assumed_unit_may_be_confirmed(folder):
-    (confirmed,) = data.open_all(folder, depth_unit="mm")
-    assert not confirmed.depth_unit.is_assumed
-    assert torch.equal(confirmed[0].depth, data.open_all(folder)[0][0].depth)
-
-
-def test_a_unit_of_a_format_in_metres_is_a_factor(frames):
-    corrected = Corrections(depth_unit="cm").apply(recording(frames))
-    torch.testing.assert_close(corrected[0].depth, frames[0].depth / 100)
 
 
 @pytest.mark.parametrize("lag", [1, 3, -2])
@@ -95,27 +82,27 @@ def test_a_lag_is_undone(lag, frames):
     assert f"depth is that of {abs(lag)} frame{plural} {'later' if lag > 0 else 'earlier'}" in corrected.report
 
 
-def test_a_lag_of_0_changes_nothing(frames):
-    whole = recording(frames)
-    assert len(Corrections(depth_lag=0).apply(whole)) == N
-    assert Corrections(depth_lag=0).apply(whole).load == whole.load
-
-
-@pytest.mark.parametrize("turn", ["left_right", "upside_down", "180", 180])
-def test_a_turn_is_undone(turn, frames):
-    undo = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[str(turn)]
-    turned = [frame.replace(depth=frame.depth.flip(undo)) for frame in frames]
-    corrected = Corrections(depth_turn=turn).apply(recording(turned))
-    assert torch.equal(corrected[3].depth, frames[3].depth) and torch.equal(corrected[3].image, frames[3].image)
-
-
-def test_all_corrections_at_once(frames):
-    opened = Corrections(depth_unit=0.5, depth_lag=1, pose_convention="cm").apply(
-        recording(frames, poses=poses_of(frames), depth_unit=DepthUnit(1.0))
-    )
-    torch.testing.assert_close(opened[0].depth, frames[1].depth / 2)
-    torch.testing.assert_close(opened.poses.t, poses_of(frames).t[:-1] / 100)
-    assert torch.equal(opened[0].image, frames[0].image)
+@pytest.mark.parametrize(
+    ("options", "fault", "k", "image"),
+    [
+        ({"depth_lag": 0}, lambda depth: depth, 3, 3),
+        ({"depth_unit": "cm"}, lambda depth: 100 * depth, 3, 3),  # a format in metres: a factor
+        ({"depth_turn": "left_right"}, lambda depth: depth.flip(-1), 3, 3),
+        ({"depth_turn": "upside_down"}, lambda depth: depth.flip(-2), 3, 3),
+        ({"depth_turn": "180"}, lambda depth: depth.flip(-2, -1), 3, 3),
+        ({"depth_turn": 180}, lambda depth: depth.flip(-2, -1), 3, 3),
+        ({"depth_unit": 0.5, "depth_lag": 1, "pose_convention": "cm"}, lambda depth: 2 * depth, 1, 0),
+    ],
+)
+def test_a_fault_of_depth_is_undone(options, fault, k, image, frames):
+    """Frame ``image`` of the result has the depth of frame ``k``."""
+    made = recording([frame.replace(depth=fault(frame.depth)) for frame in frames], poses=poses_of(frames))
+    corrected = Corrections(**options).apply(made)
+    lag, scale = options.get("depth_lag", 0), 0.01 if "pose_convention" in options else 1
+    assert len(corrected) == N - lag
+    torch.testing.assert_close(corrected[image].depth, frames[k].depth)
+    assert torch.equal(corrected[image].image, frames[image].image)
+    torch.testing.assert_close(corrected.poses.t, poses_of(frames).t[: N - lag] * scale)
 
 
 @pytest.mark.parametrize(
@@ -129,17 +116,12 @@ def test_all_corrections_at_once(frames):
         ("depth_lag", 1.5, "a whole number of frames"),
         ("depth_lag", "1", "a whole number of frames"),
         ("depth_lag", True, "a whole number of frames"),
+        *(("depth_lag", lag, "less") for lag in (N, -N, 100)),  # as long as the recording
     ],
 )
 def test_a_wrong_value_is_refused_before_anything_is_read(option, value, expected, folder):
     with pytest.raises(ValueError, match=rf"^{option}: found {re.escape(repr(value))[:4]}.*expected .*{expected}"):
         data.open_all(folder, **{option: value})
-
-
-@pytest.mark.parametrize("lag", [N, -N, 100])
-def test_a_lag_as_long_as_the_recording_is_refused(lag, folder):
-    with pytest.raises(ValueError, match=f"depth_lag: found {lag} for {N} frames, expected less"):
-        data.open_all(folder, depth_lag=lag)
 
 
 def test_a_factor_of_poses_may_be_a_number(folder, frames):

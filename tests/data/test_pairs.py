@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -30,38 +31,83 @@ def line(n: int, **fields: object) -> Recording:
     return replace(whole, **fields)
 
 
-def test_by_gap_steps_by_two_from_25_frames_on() -> None:
-    assert pairs.by_gap(line(5), 3) == [(0, 3), (1, 4)]
-    assert pairs.by_gap(line(24), 20) == [(0, 20), (1, 21), (2, 22), (3, 23)]
-    assert pairs.by_gap(line(25), 20) == [(0, 20), (2, 22), (4, 24)]
-    assert pairs.by_gap(line(25), 20, stride=3) == [(0, 20), (3, 23)]
-    assert pairs.by_gap(Scene(line(5), gap=4)) == [(0, 4)]
-    assert pairs.by_gap(line(2)) == [(0, 1)], "two frames are one pair"
-    assert pairs.by_gap(line(2, number=torch.tensor([3, 8]))) == [(0, 1)]
+LOST = line(4, number=torch.tensor([0, 1, 3, 4]))
+GAPS = line(5, number=torch.tensor([0, 1, 4, 5, 9]))
+FAR = line(3, number=torch.tensor([0, 50, 51]))
+TWO = line(2, number=torch.tensor([3, 90]))
+BACK = replace(
+    line(5),
+    poses=Pose(
+        line(5).poses.R, torch.tensor([0, 0.2, 0, 0.2, 0.2], dtype=torch.float64)[:, None] * torch.eye(3).double()[0]
+    ),
+)
+RIG = join_cameras([line(4, name=name, camera_name=name) for name in ("a", "b", "c")])
+
+#: Pairs, or positions, and what they are.
+CHOSEN = [
+    (lambda: pairs.by_gap(line(5), 3), [(0, 3), (1, 4)]),
+    (lambda: pairs.by_gap(line(24), 20), [(0, 20), (1, 21), (2, 22), (3, 23)]),
+    (lambda: pairs.by_gap(line(25), 20), [(0, 20), (2, 22), (4, 24)]),  # from 25 frames on by two
+    (lambda: pairs.by_gap(line(25), 20, stride=3), [(0, 20), (3, 23)]),
+    (lambda: pairs.by_gap(Scene(line(5), gap=4)), [(0, 4)]),
+    (lambda: pairs.by_gap(line(2)), [(0, 1)]),  # two frames are one pair
+    (lambda: pairs.by_gap(line(2, number=torch.tensor([3, 8]))), [(0, 1)]),
+    (lambda: pairs.by_gap(LOST, 1), [(0, 1), (2, 3)]),  # a lost frame does not shift pairs
+    (lambda: pairs.by_gap(LOST, 2), [(1, 2)]),
+    (lambda: pairs.by_gap(LOST, 4), [(0, 3)]),
+    (lambda: pairs.by_time(line(5), 0.3), [(0, 3), (1, 4)]),
+    (lambda: pairs.by_time(line(5), 0.34), [(0, 3), (1, 4)]),
+    (lambda: pairs.by_time(line(4, times=torch.tensor([0, 0.1, 0.3, 0.4]).double()), 0.2, tolerance=0.01), [(1, 2)]),
+    (lambda: pairs.by_baseline(line(5), 0.15, tolerance=0.001), [(0, 3), (1, 4)]),
+    (lambda: pairs.by_baseline(line(6), 0.18), [(0, 3), (1, 4), (2, 5)]),  # 0.15 m is within a quarter of 0.18 m
+    (lambda: pairs.by_baseline(BACK, 0.2, tolerance=0.01), [(0, 1), (1, 2), (2, 3)]),  # the earliest
+    (lambda: pairs.by_scaled_gap(Scene(line(5), gap=2), 0.5), [(0, 1), (1, 2), (2, 3), (3, 4)]),
+    (lambda: pairs.by_scaled_gap(Scene(line(5), gap=1), 0.5), [(0, 1), (1, 2), (2, 3), (3, 4)]),  # at least one frame
+    (lambda: pairs.by_scaled_gap(Scene(line(5), gap=3), 2.0), []),
+    (lambda: pairs.by_scaled_gap(Scene(line(3, number=torch.tensor([0, 2, 4])), gap=3), 1.0), []),
+    *(
+        (lambda factor=factor: pairs.by_scaled_gap(Scene(line(12), gap=3), factor, stride=1)[:1], [(0, gap)])
+        for factor, gap in ((0.5, 2), (0.1, 1), (2.0, 6), (1.4, 4))
+    ),
+    (lambda: pairs.by_choice(line(4)), [(0, (1, 2, 3)), (1, (0, 2, 3)), (2, (0, 1, 3)), (3, (0, 1, 2))]),
+    (lambda: [p.reference for p in pairs.by_choice(line(60))], [*range(0, 60, 2)]),  # the stride of the other ways
+    (lambda: [list(p.candidates) for p in pairs.by_choice(line(60))], [pairs.candidate_frames(line(60), i) for i in range(0, 60, 2)]),
+    (lambda: pairs.by_choice(line(9), steps=[4, 1, 4], stride=4), [(0, (1, 4)), (4, (0, 3, 5, 8)), (8, (4, 7))]),
+    (lambda: pairs.by_choice(GAPS, steps=(1, 4)), [(0, (1, 2)), (1, (0, 3)), (2, (0, 3)), (3, (1, 2, 4)), (4, (3,))]),
+    (lambda: pairs.by_choice(TWO), [(0, (1,)), (1, (0,))]),  # two frames, far apart
+    (lambda: pairs.by_choice(line(4), past=True), [(1, (0,)), (2, (0, 1)), (3, (0, 1, 2))]),
+    (lambda: pairs.by_choice(line(2), past=True), [(1, (0,))]),
+    (lambda: [p for p in pairs.by_choice(line(40), past=True) if not max(p.candidates) < p.reference > 0], []),
+    (lambda: pairs.by_choice(FAR, past=True), [(1, (0,)), (2, (1,))]),  # where no step fits, the nearest before it
+    (lambda: pairs.to_fixed_pairs(pairs.by_gap(line(5), 3)), [(0, 3), (1, 4)]),
+    (lambda: pairs.to_fixed_pairs([(0, 3), (1, 4)]), [(0, 3), (1, 4)]),
+    (lambda: pairs.Pair(0, 3).candidates, ()),
+    (lambda: pairs.Pair(*(0, (1, 2))).candidates, (1, 2)),
+    (lambda: pairs.spaced_frames(3, 9, 1), [9]),
+    (lambda: pairs.spaced_frames(9, 3, 1), [3]),
+    (lambda: pairs.spaced_frames(0, 20, 5), [4, 8, 12, 16, 20]),
+    (lambda: pairs.spaced_frames(2, 9, 7), [3, 4, 5, 6, 7, 8, 9]),
+    (lambda: pairs.spaced_frames(2, 9, 3), [4, 7, 9]),
+    (lambda: pairs.candidate_frames(line(60), 30), [0, 10, 18, 22, 25, 27, 28, 29, 31, 32, 33, 35, 38, 42, 50]),
+    (lambda: pairs.candidate_frames(line(10), 0), [1, 2, 3, 5, 8]),
+    (lambda: pairs.candidate_frames(line(10), 9, steps=(1, 4)), [5, 8]),
+    (lambda: pairs.candidate_frames(GAPS, 2), [1, 3, 4]),  # numbers 4 - 3, 4 + 1 and 4 + 5 are there
+    (lambda: pairs.candidate_frames(line(2, number=torch.tensor([0, 7])), 0), [1]),  # where no step fits the nearest
+    (lambda: pairs.candidate_frames(line(3, number=torch.tensor([0, 50, 110])), 1), [0]),
+    (lambda: pairs.by_cameras(RIG)[:4], [(0, (1, 2)), (1, (0, 2)), (2, (0, 1)), (3, (4, 5))]),
+    (
+        lambda: pairs.by_cameras(RIG, instants=[1], reference="b", past=True),
+        [(3 * k + 1, (3 * k - 3, 3 * k - 2, 3 * k - 1)) for k in (1, 2, 3)],
+    ),
+    (lambda: pairs.by_cameras(RIG, instants=[1], reference="c")[1], (5, (0, 1, 2, 6, 7, 8))),
+    (lambda: Scene.of(line(2, number=torch.tensor([3, 8]))).gap, 5),  # two frames know their step
+    (lambda: (Scene(line(2), gap=7).gap, Scene.of(line(3)).gap), (7, None)),
+]  # fmt: skip
 
 
-def test_a_lost_frame_does_not_shift_pairs() -> None:
-    lost = line(4, number=torch.tensor([0, 1, 3, 4]))
-    assert pairs.by_gap(lost, 1) == [(0, 1), (2, 3)]
-    assert pairs.by_gap(lost, 2) == [(1, 2)]
-    assert pairs.by_gap(lost, 4) == [(0, 3)]
-
-
-def test_by_time_takes_the_closest_within_tolerance() -> None:
-    assert pairs.by_time(line(5), 0.3) == [(0, 3), (1, 4)]
-    assert pairs.by_time(line(5), 0.34) == [(0, 3), (1, 4)]
-    lost = line(4, times=torch.tensor([0, 0.1, 0.3, 0.4], dtype=torch.float64))
-    assert pairs.by_time(lost, 0.2, tolerance=0.01) == [(1, 2)]
-    with pytest.raises(ValueError, match=r"found no two of 5 frames of line at 0.34 s ± 0.01 s, expected at least one"):
-        pairs.by_time(line(5), 0.34, tolerance=0.01)
-
-
-def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
-    assert pairs.by_baseline(line(5), 0.15, tolerance=0.001) == [(0, 3), (1, 4)]
-    assert pairs.by_baseline(line(6), 0.18) == [(0, 3), (1, 4), (2, 5)]  # 0.15 m is within a quarter of 0.18 m
-    back = line(5)
-    back.poses.t[:, 0] = torch.tensor([0, 0.2, 0, 0.2, 0.2], dtype=torch.float64)
-    assert pairs.by_baseline(back, 0.2, tolerance=0.01) == [(0, 1), (1, 2), (2, 3)]
+@pytest.mark.parametrize(("call", "expected"), CHOSEN)
+def test_frames_that_make_a_pair(call: Callable[[], object], expected: object) -> None:
+    assert call() == expected
 
 
 @pytest.mark.parametrize(
@@ -95,69 +141,21 @@ def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
             lambda: pairs.by_gap(line(3, number=torch.tensor([0, 2, 4])), 3),
             r"found no two of 3 frames of line at gap 3",
         ),
+        (lambda: pairs.by_time(line(5), 0.34, tolerance=0.01), r"found no two of 5 frames of line at 0.34 s ± 0.01 s, expected at least one"),
+        (lambda: pairs.by_scaled_gap(line(5), 1.0), r"pairs.factor: line has no gap"),
+        (lambda: pairs.candidate_frames(line(3), 0, past=True), "line has nothing before frame 0, expected a later one"),
+        (lambda: pairs.candidate_frames(line(1), 0), "has one frame"),
+        (lambda: pairs.candidate_frames(line(4), 9), "frame 9 of line"),
+        (lambda: pairs.to_fixed_pairs(pairs.by_choice(line(3))), r"pairs: found 2 candidate frames \(pairs=auto\).*pairs=gap, time or"),
+        (lambda: pairs.spaced_frames(0, 3, 4), r"views: found 4 for frames 0 to 3, expected 1 to 3"),
+        *((choose, r"data: found \[\], expected a recording whose camera moves") for choose in (
+            lambda: pairs.by_gap([]), lambda: pairs.by_time([], seconds=1.0), lambda: pairs.by_baseline([], metres=1.0),
+        )),
     ],
-)
+)  # fmt: skip
 def test_impossible_pairs_say_why(call: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
-
-
-def test_scaled_gaps_of_a_short_recording_are_missing_not_fatal() -> None:
-    assert pairs.by_scaled_gap(Scene(line(5), gap=2), 0.5) == [(0, 1), (1, 2), (2, 3), (3, 4)]
-    assert pairs.by_scaled_gap(Scene(line(5), gap=1), 0.5) == pairs.by_gap(line(5), 1), "at least one frame"
-    assert pairs.by_scaled_gap(Scene(line(5), gap=3), 2.0) == []
-    assert pairs.by_scaled_gap(Scene(line(3, number=torch.tensor([0, 2, 4])), gap=3), 1.0) == []
-    with pytest.raises(ValueError, match=r"pairs.factor: line has no gap"):
-        pairs.by_scaled_gap(line(5), 1.0)
-
-
-def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
-    assert pairs.by_choice(line(4)) == [(0, (1, 2, 3)), (1, (0, 2, 3)), (2, (0, 1, 3)), (3, (0, 1, 2))]
-    long = pairs.by_choice(line(60))
-    assert [p.reference for p in long] == [*range(0, 60, 2)], "the stride is that of the other ways"
-    assert all(list(p.candidates) == pairs.candidate_frames(line(60), p.reference) for p in long)
-    assert pairs.by_choice(line(9), steps=[4, 1, 4], stride=4) == [(0, (1, 4)), (4, (0, 3, 5, 8)), (8, (4, 7))]
-    lost = line(5, number=torch.tensor([0, 1, 4, 5, 9]))
-    assert pairs.by_choice(lost, steps=(1, 4)) == [(0, (1, 2)), (1, (0, 3)), (2, (0, 3)), (3, (1, 2, 4)), (4, (3,))]
-    assert pairs.by_choice(line(2, number=torch.tensor([3, 90]))) == [(0, (1,)), (1, (0,))], "two frames, far apart"
-
-
-def test_past_frames_alone_leave_the_first_without_an_anchor() -> None:
-    assert pairs.by_choice(line(4), past=True) == [(1, (0,)), (2, (0, 1)), (3, (0, 1, 2))]
-    assert pairs.by_choice(line(2), past=True) == [(1, (0,))]
-    assert all(max(p.candidates) < p.reference > 0 for p in pairs.by_choice(line(40), past=True))
-    far = line(3, number=torch.tensor([0, 50, 51]))
-    assert pairs.by_choice(far, past=True) == [(1, (0,)), (2, (1,))], "where no step fits, the nearest before it"
-    with pytest.raises(ValueError, match="line has nothing before frame 0, expected a later one"):
-        pairs.candidate_frames(line(3), 0, past=True)
-
-
-def test_what_cannot_choose_takes_pairs_of_two_frames() -> None:
-    assert pairs.to_fixed_pairs(pairs.by_gap(line(5), 3)) == [(0, 3), (1, 4)] == pairs.to_fixed_pairs([(0, 3), (1, 4)])
-    with pytest.raises(ValueError, match=r"pairs: found 2 candidate frames \(pairs=auto\).*pairs=gap, time or"):
-        pairs.to_fixed_pairs(pairs.by_choice(line(3)))
-    assert pairs.Pair(0, 3).candidates == () and pairs.Pair(*(0, (1, 2))).candidates == (1, 2)
-
-
-def test_views_between_are_different_and_end_at_the_other() -> None:
-    assert pairs.spaced_frames(3, 9, 1) == [9]
-    assert pairs.spaced_frames(0, 20, 5) == [4, 8, 12, 16, 20]
-    for n in range(1, 8):
-        found = pairs.spaced_frames(2, 9, n)
-        assert len(set(found)) == n and found[-1] == 9 and min(found) > 2 and found == sorted(found)
-    with pytest.raises(ValueError, match=r"views: found 4 for frames 0 to 3, expected 1 to 3"):
-        pairs.spaced_frames(0, 3, 4)
-
-
-def test_what_is_no_recording_has_no_pairs() -> None:
-    for choose in (pairs.by_gap, partial(pairs.by_time, seconds=1.0), partial(pairs.by_baseline, metres=1.0)):
-        with pytest.raises(ValueError, match=r"data: found \[\], expected a recording whose camera moves"):
-            choose([])
-
-
-def test_a_recording_of_two_frames_knows_its_step() -> None:
-    assert Scene.of(line(2, number=torch.tensor([3, 8]))).gap == 5 and Scene(line(2), gap=7).gap == 7
-    assert Scene.of(line(3)).gap is None
 
 
 def test_scenes_are_opened_when_they_are_asked_for() -> None:
@@ -179,34 +177,3 @@ def test_scenes_are_opened_when_they_are_asked_for() -> None:
     first = room_scene[0]
     assert scenes_of(first) == [first] and scenes_of([first, line(4)])[0] is first
     assert [s.recording.name for s in scenes_of(line(4))] == ["line"]
-
-
-def test_frames_around_are_those_at_the_steps_before_and_after() -> None:
-    assert pairs.candidate_frames(line(60), 30) == [0, 10, 18, 22, 25, 27, 28, 29, 31, 32, 33, 35, 38, 42, 50]
-    assert pairs.candidate_frames(line(10), 0) == [1, 2, 3, 5, 8]
-    assert pairs.candidate_frames(line(10), 9, steps=(1, 4)) == [5, 8]
-    lost = torch.tensor([0, 1, 4, 5, 9])
-    assert pairs.candidate_frames(line(5, number=lost), 2) == [1, 3, 4], "numbers 4 - 3, 4 + 1 and 4 + 5 are there"
-
-
-def test_where_no_step_fits_the_nearest_frame_is_offered() -> None:
-    assert pairs.candidate_frames(line(2, number=torch.tensor([0, 7])), 0) == [1]
-    assert pairs.candidate_frames(line(3, number=torch.tensor([0, 50, 110])), 1) == [0]
-    with pytest.raises(ValueError, match="has one frame"):
-        pairs.candidate_frames(line(1), 0)
-    with pytest.raises(ValueError, match="frame 9 of line"):
-        pairs.candidate_frames(line(4), 9)
-
-
-def test_frames_of_three_cameras_are_those_of_their_instants():
-    rig = join_cameras([line(4, name=name, camera_name=name) for name in ("a", "b", "c")])
-    assert [tuple(pair) for pair in pairs.by_cameras(rig)][:4] == [(0, (1, 2)), (1, (0, 2)), (2, (0, 1)), (3, (4, 5))]
-    past = pairs.by_cameras(rig, instants=[1], reference="b", past=True)
-    assert [tuple(pair) for pair in past] == [(3 * k + 1, (3 * k - 3, 3 * k - 2, 3 * k - 1)) for k in (1, 2, 3)]
-    (both,) = [pair for pair in pairs.by_cameras(rig, instants=[1], reference="c") if pair.reference == 5]
-    assert both.candidates == (0, 1, 2, 6, 7, 8)
-
-
-@pytest.mark.parametrize(("factor", "gap"), [(0.5, 2), (0.1, 1), (2.0, 6), (1.4, 4)])
-def test_a_scaled_gap_is_rounded_and_at_least_1(factor, gap):
-    assert tuple(pairs.by_scaled_gap(Scene(line(12), gap=3), factor, stride=1)[0]) == (0, gap)

@@ -35,49 +35,55 @@ def codes():
     ]
 
 
-def found(codes, unit=ASSUMED, sparse=False):
-    """Codes and texts of the findings on depth maps of these codes."""
-    return [(f.code, f.text, f.remedy) for f in plausibility_findings([c * unit.metres for c in codes], unit, sparse)]
-
-
 def swap_bytes(code):
     return 256 * (code % 256) + code // 256
 
 
-def test_sound_depth_is_not_doubted(codes):
-    assert not found(codes) and not found(codes, MM) and not found([5 * c for c in codes], TUM)
-    assert not plausibility_findings([c / 1000 for c in codes], None)
-    assert not plausibility_findings([], MM) and not found([torch.zeros(120, 160).long()])
+METRES = DepthUnit(1.0)
+STATED = DepthUnit(1 / 8000, "option depth_unit")
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit", "likelier", "words"),
-    [
-        (10, ASSUMED, "1/10000", "beyond the reach of a short-range depth sensor"),
-        (10, MM, "1/10000", "beyond the reach"),
-        (0.05, ASSUMED, "1/100", "at or below the minimum range"),
-        (1, DepthUnit(0.01), "1/1000", "beyond"),
-    ],
-)
-def test_a_wrong_unit_is_doubted_with_a_likelier_one(codes, factor, unit, likelier, words):
-    ((code, text, remedy),) = found([(c * factor).round().long() for c in codes], unit)
-    assert code == "unit" and words in text and f"depth unit {likelier} m?" in text
-    assert remedy == f"data.depth_unit={likelier}" and str(unit) in text
+def z_buffer(near):
+    return lambda c: (1 - near / (c / 1000)) / (1 - near / 50)
 
 
-def test_the_unit_that_is_suggested_is_not_doubted(codes):
-    tenfold = [10 * c for c in codes]
-    assert found(tenfold) and not found(tenfold, DepthUnit(1 / 10000, "option depth_unit"))
+#: What a capture stores of the codes, its unit (None: metres by its format), whether it is sparse; the finding's code,
+#: words of its text and its remedy, or None for sound depth.
+STORED = [
+    *((change, unit, False, None, "", "") for change, unit in [
+        (lambda c: c, ASSUMED), (lambda c: c, MM), (lambda c: 5 * c, TUM), (lambda c: 0 * c, ASSUMED),
+        (lambda c: 10 * c, DepthUnit(1 / 10000, "option depth_unit")),  # the unit that is suggested
+    ]),
+    (lambda c: c / 1000, None, False, None, "", ""),
+    (lambda c: 10 * c, ASSUMED, False, "unit", "beyond the reach of a short-range depth sensor.*depth unit 1/10000 m\\?", "data.depth_unit=1/10000"),
+    (lambda c: 10 * c, MM, False, "unit", "beyond the reach.*depth unit 1/10000 m\\?", "data.depth_unit=1/10000"),
+    (lambda c: (0.05 * c).round().long(), ASSUMED, False, "unit", "at or below the minimum range.*depth unit 1/100 m\\?", "data.depth_unit=1/100"),
+    (lambda c: c, DepthUnit(0.01), False, "unit", "beyond.*depth unit 1/1000 m\\?", "data.depth_unit=1/1000"),
+    (lambda c: c.double(), None, False, "unit", "", "data.depth_unit=1/1000"),  # millimetres as metres
+    (lambda c: 20 * c / 1000, None, False, None, "", ""),  # a street in metres
+    (lambda c: 20 * c, MM, True, None, "", ""),
+    (swap_bytes, MM, False, "byte_order", "differ [1-9].* times as much.*other byte order", "swap"),
+    (lambda c: (c << 3) % 65536 + (c >> 13), ASSUMED, False, "shifted", "SUN3D", "data.depth_unit=1/8000"),
+    (lambda c: (c << 3) % 65536 + (c >> 13), STATED, False, None, "", ""),
+    *((lambda c, step=step: ((c / step).round() * step).round().long(), MM, False, "8_bit", "equal steps", "16 bits") for step in (20, 39.2)),
+    (lambda c: (285_000 / (285_000 / c).round()).round().long(), MM, False, None, "", ""),  # disparities in few steps
+    *((z_buffer(near), METRES, False, "z_buffer", "non-linear", "") for near in (0.005, 0.01, 0.05)),
+    (lambda c: c / 5000, DepthUnit(1.0, "file"), False, None, "", ""),  # a table top in metres
+]  # fmt: skip
 
 
-def test_millimetres_as_metres_are_doubted_and_metres_of_a_street_are_not(codes):
-    (finding,) = plausibility_findings([c.double() for c in codes], None)
-    assert finding.code == "unit" and "data.depth_unit=1/1000" in finding.remedy
-    street = [20 * c / 1000 for c in codes]
-    assert not plausibility_findings(street, None) and not plausibility_findings(street, MM, sparse=True)
+@pytest.mark.parametrize(("stored", "unit", "sparse", "code", "words", "remedy"), STORED)
+def test_gross_errors_are_doubted_and_sound_depth_is_not(codes, stored, unit, sparse, code, words, remedy):
+    metres = 1.0 if unit is None else unit.metres
+    findings = plausibility_findings([stored(c) * metres for c in codes], unit, sparse)
+    assert [each.code for each in findings] == ([] if code is None else [code])
+    for each in findings:
+        assert re.search(words, each.text) and remedy in each.remedy
+        assert code != "unit" or unit is None or str(unit) in each.text
 
 
 def test_every_row_of_a_small_map_counts_and_evenly_spaced_ones_of_a_large_one():
+    assert not plausibility_findings([], MM)
     street = torch.zeros(2, 600)
     street[1] = 3000.0
     assert plausibility_findings([street], None, False)
@@ -88,42 +94,10 @@ def test_every_row_of_a_small_map_counts_and_evenly_spaced_ones_of_a_large_one()
     assert plausibility_findings([large], None, False)
 
 
-def test_swapped_bytes_are_found(codes):
-    ((code, text, remedy),) = found([swap_bytes(c) for c in codes], MM)
-    assert code == "byte_order" and "other byte order" in text and "swap" in remedy
-    assert float(re.search(r"differ (\d+) times as much", text).group(1)) > 1
-
-
-def test_codes_rotated_by_three_bits_are_found_unless_the_unit_is_stated(codes):
-    rotated = [(c << 3) % 65536 + (c >> 13) for c in codes]
-    ((code, text, remedy),) = found(rotated)
-    assert code == "shifted" and "SUN3D" in text and remedy == "data.depth_unit=1/8000"
-    assert not found(rotated, DepthUnit(1 / 8000, "option depth_unit"))
-
-
-@pytest.mark.parametrize("step", [20, 39.2])
-def test_depth_of_8_bits_is_found(codes, step):
-    ((code, text, remedy),) = found([((c / step).round() * step).round().long() for c in codes], MM)
-    assert code == "8_bit" and "equal steps" in text and "16 bits" in remedy
-
-
 @pytest.mark.parametrize(("n", "doubted"), [(2, False), (3, True), (256, True), (257, False)])
 def test_8_bit_depth_has_three_to_256_different_values(n, doubted):
     floats = (1.0 + 0.02 * (torch.arange(1200.0) % n)).reshape(30, 40)
     assert [f.code for f in plausibility_findings([floats], MM, False)] == ["8_bit"] * doubted
-
-
-def test_disparities_in_few_steps_are_not_8_bit_depth(codes):
-    stereo = [(285_000 / (285_000 / c).round()).round().long() for c in codes]
-    assert len(torch.cat(stereo).unique()) <= 256 and not found(stereo, MM)
-
-
-@pytest.mark.parametrize("near", [0.005, 0.01, 0.05])
-def test_a_z_buffer_is_found(codes, near):
-    depth = [(1 - near / (c / 1000)) / (1 - near / 50) for c in codes]
-    (finding,) = plausibility_findings(depth, DepthUnit(1.0))
-    assert finding.code == "z_buffer" and "non-linear" in finding.text
-    assert not plausibility_findings([c / 5000 for c in codes], DepthUnit(1.0, "file")), "a table top in metres"
 
 
 @pytest.mark.skipif(not ROOT.is_dir(), reason="no DHTORCH_DATA")

@@ -36,36 +36,37 @@ def random_poses(n=40):
     return Pose(rotation(random_quaternions(n)), torch.randn(n, 3, dtype=torch.float64, generator=g))
 
 
-def test_every_reading_is_undone():
+def test_every_reading_is_undone_and_its_words_are_read_back():
     true = random_poses()
     for reading in pose_readings():
         meant = reading.convention.apply(state_poses(true, reading.convention))
         assert float((se3.to_matrix(meant) - se3.to_matrix(true)).abs().max()) < 1e-9, reading
+        assert parse_pose_convention(str(reading.convention)) == reading.convention
+    assert str(PoseConvention()) == "opencv" and PoseConvention().is_trivial
+    assert not PoseConvention(unit="mm").is_trivial
+    assert parse_pose_convention(0.1) == parse_pose_convention("0.1") == PoseConvention(unit=0.1)
 
 
-def test_axes_are_directions_of_the_columns():
-    true = random_poses()
+def stated_otherwise():
+    """Convention → (poses as a file states them, what they mean)."""
+    true, q = random_poses(), random_quaternions()
     right, down, forward = true.R.unbind(-1)
-    opengl = Pose(torch.stack((right, -down, -forward), -1), true.t)
-    ros = Pose(torch.stack((forward, -right, -down), -1), true.t)
-    for name, stated in {"opengl": opengl, "ros": ros}.items():
-        torch.testing.assert_close(parse_pose_convention(name).apply(stated).R, true.R)
+    inverse, none = se3.invert(true), torch.zeros(len(q), 3, dtype=torch.float64)
+    turned = Pose(rotation(q), none)
+    return {
+        "opengl": (Pose(torch.stack((right, -down, -forward), -1), true.t), true),
+        "ros": (Pose(torch.stack((forward, -right, -down), -1), true.t), true),
+        "wxyz": (Pose(rotation(q[:, [3, 0, 1, 2]]), none), turned),  # numbers w x y z, read as x y z w
+        "xyzw": (Pose(rotation(q[:, [1, 2, 3, 0]]), none), turned),
+        "world_to_camera+mm": (Pose(inverse.R, 1000 * inverse.t), true),  # the unit is that of the file
+    }
 
 
-def test_quaternions_of_the_other_order():
-    """Numbers w x y z of a file, taken as x y z w by a reader, and the reverse."""
-    q = random_quaternions()
-    t = torch.zeros(len(q), 3, dtype=torch.float64)
-    for order, indices in {"wxyz": [3, 0, 1, 2], "xyzw": [1, 2, 3, 0]}.items():
-        as_read = Pose(rotation(q[:, indices]), t)
-        torch.testing.assert_close(PoseConvention(quaternion=order).apply(as_read).R, rotation(q))
-
-
-def test_a_unit_scales_translations_before_the_inverse():
-    true = random_poses()
-    inverse = se3.invert(true)
-    meant = parse_pose_convention("world_to_camera+mm").apply(Pose(inverse.R, 1000 * inverse.t))
-    torch.testing.assert_close(meant.t, true.t)
+@pytest.mark.parametrize("convention", stated_otherwise())
+def test_stated_poses_mean_the_true_ones(convention):
+    stated, true = stated_otherwise()[convention]
+    meant = parse_pose_convention(convention).apply(stated)
+    torch.testing.assert_close(se3.to_matrix(meant), se3.to_matrix(true))
 
 
 def test_there_are_24_right_handed_axes():
@@ -77,20 +78,9 @@ def test_there_are_24_right_handed_axes():
         assert torch.equal(torch.linalg.cross(a, b), c), each
 
 
-def test_words_of_every_reading_are_read_back():
-    for reading in pose_readings():
-        assert parse_pose_convention(str(reading.convention)) == reading.convention
-    assert str(PoseConvention()) == "opencv" and PoseConvention().is_trivial
-    assert not PoseConvention(unit="mm").is_trivial
-
-
 @pytest.mark.parametrize("text", DESCRIPTIONS)
 def test_descriptions(text):
     assert parse_pose_convention(text).describe() == DESCRIPTIONS[text]
-
-
-def test_a_factor_may_be_a_number():
-    assert parse_pose_convention(0.1) == parse_pose_convention("0.1") == PoseConvention(unit=0.1)
 
 
 @pytest.mark.parametrize(
