@@ -1,11 +1,11 @@
 """Fit the calibration that travels with the package: what a score and a sigma of ``map`` turned out to be worth.
 
-python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
+python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/metrics/calibration/map.json
 python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
 python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
 python benchmarks/fit_calibration.py --method fused                of the joint answers at samples and at pixels, also
                                    of five built-in rooms with a phone's noise; four reference views a scene, one
-                                   seed; writes dhtorch/calibration/fused.json
+                                   seed; writes dhtorch/metrics/calibration/fused.json
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. Sigma is that of the real
 scenes: tracks in the built-in rooms are cleaner than a phone's. What the same recipe is worth in
@@ -26,15 +26,14 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
-from dhtorch import calibration, pytree
-from dhtorch.calibration import score_calibration
+from dhtorch import pytree
 from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap, candidate_frames
 from dhtorch.data.scene import scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.compare import dense_comparison
 from dhtorch.experiments.compare_methods import MIN_ANSWERS_ABOVE_THRESHOLD as FEW
-from dhtorch.metrics import control
+from dhtorch.metrics import calibration, control
 from dhtorch.metrics.errors import Points
 
 #: Reference views of every scene whose maps the calibration of joint answers is fitted on.
@@ -101,10 +100,10 @@ def main() -> int:
         if method.views == 1
         else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
     )
-    fitted = score_calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
+    fitted = calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
     real = [points for name, points in pooled.items() if not name.startswith("synthetic")]
-    fitted = replace(fitted, sigma=score_calibration.fit_sigma_model(real))
-    target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
+    fitted = replace(fitted, sigma=calibration.fit_sigma_model(real))
+    target = options.output or HERE.parent / "dhtorch" / "metrics" / "calibration" / f"{options.method}.json"
     print(calibration.save_calibration(fitted, target))
     return 0
 

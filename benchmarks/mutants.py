@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GROUPS = {
     "data": "data",
     **dict.fromkeys(("geometry", "ops", "stages"), "geometry, ops, stages"),
-    **dict.fromkeys(("pipeline", "calibration", "alignment", "metrics"), "pipeline, calibration, alignment, metrics"),
+    **dict.fromkeys(("pipeline", "alignment", "metrics"), "pipeline, alignment, metrics"),
     **dict.fromkeys(("cli", "viz", "runtime"), "cli, viz, runtime"),
 }
 OTHER = "all others"

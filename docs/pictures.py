@@ -32,7 +32,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
-from dhtorch import calibration, data
+from dhtorch import data
 from dhtorch.cli.run import config_dir
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_choice
@@ -40,6 +40,7 @@ from dhtorch.data.scene import Scene
 from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Settings
 from dhtorch.integrate.sweeps import DenseSweep
+from dhtorch.metrics import calibration
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth

@@ -22,7 +22,6 @@ FLOORS = (
     {"transforms", "measure"},
     {"validation", "integrate", "synthetic"},
     {"pipeline", "functional"},
-    {"calibration"},
     {"stages", "alignment", "metrics", "losses", "export", "data"},
     {"viz"},
     {"records"},

@@ -775,10 +775,13 @@ ELSEWHERE = {
         )
     ),
     *(
-        f"dhtorch.calibration.score_calibration.{name}"
-        for name in ("fit_calibration", "fit_sigma_model", "parse_calibration")
+        f"dhtorch.metrics.calibration.{name}"
+        for name in (
+            *("fit_calibration", "fit_sigma_model", "parse_calibration"),
+            *("list_calibrations", "load_calibration", "load_probability", "save_calibration"),
+        )
     ),
-    *(f"dhtorch.calibration.monotone.{name}" for name in ("fit_isotonic", "fit_platt")),
+    *(f"dhtorch.metrics.monotone.{name}" for name in ("fit_isotonic", "fit_platt")),
     *(
         f"dhtorch.metrics.control.{name}"
         for name in (
@@ -1047,7 +1050,7 @@ def public_functions():
         *ESTIMATORS,
     ]
     parts.append(importlib.import_module("dhtorch.experiments.probes.ridge"))
-    for package in ("geometry", "stages", "metrics", "calibration", "integrate"):
+    for package in ("geometry", "stages", "metrics", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")
         parts += [importlib.import_module(info.name) for info in found]

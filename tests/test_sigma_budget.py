@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dhtorch.calibration.score_calibration import SigmaModel
 from dhtorch.codes import Cause, Source
+from dhtorch.metrics.calibration import SigmaModel
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.presets import METHODS

@@ -18,13 +18,13 @@ from support.stored_values import stored_values
 
 from dhtorch import CameraPin, align_depth, complete_depth, validate_depth
 from dhtorch.alignment.references import collect_references
-from dhtorch.calibration.score_calibration import fit_calibration
 from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.integrate import DepthView, extract_mesh, extract_points, fuse_views, make_volume
 from dhtorch.measure import metric_scale
 from dhtorch.metrics import errors, reliability, risk
+from dhtorch.metrics.calibration import fit_calibration
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, WINDOW
 from dhtorch.pytree import collate, stack

@@ -59,7 +59,7 @@ def residual_variance(
         near = points.used & points.near
         r = r - masked_median(r, near).maximum(-fit_sigma).minimum(fit_sigma)
         deviation_map = _local_deviation(log, known, options)
-        roughness = _roughness(deviation_map, known, options)
+        roughness = _window_mean(deviation_map.square(), known, _window_side(deviation_map, options)).sqrt()
         h = sample_at_references(roughness, points.share)[0].clamp_min(1e-9)
         rough = near & (h >= masked_median(h, near))
         flat, gain = _levels(r, read, h, (near, rough), options)
@@ -162,11 +162,6 @@ def _positive_part(total: Tensor, square: Tensor) -> Tensor:
     """Sum and its squared standard error -> shrunk sum: 0 below one error, nearly the whole beyond several (the
     positive part of James and Stein's estimate)."""
     return (total - square / total.clamp_min(1e-18)).clamp_min(0)
-
-
-def _roughness(deviation: Tensor, valid: Tensor, options: AlignmentOptions) -> Tensor:
-    """Root mean square (B, h, w) of the map's deviation from its surroundings over the same window."""
-    return _window_mean(deviation.square(), valid, _window_side(deviation, options)).sqrt()
 
 
 def _local_deviation(x: Tensor, valid: Tensor, options: AlignmentOptions) -> Tensor:

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 
 from dhtorch import pytree
-from dhtorch.calibration.score_calibration import fit_calibration
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
+from dhtorch.metrics.calibration import fit_calibration
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.uncertainty import measure_uncertainty
 

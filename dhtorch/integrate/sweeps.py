@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Source, is_estimated
 from dhtorch.geometry.windows import window_extreme
+from dhtorch.metrics.calibration import Calibration
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method

@@ -13,8 +13,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-#: Statistics that combine the values of scenes; the geometric mean is for ratios.
-_STATISTICS = ("median", "mean", "geometric_mean")
+#: Statistics that combine the values of scenes (draws, n), by name; the geometric mean is for ratios.
+_STATISTICS: dict[str, Callable[[Tensor], Tensor]] = {
+    "median": lambda x: x.sort(-1).values[:, [(x.shape[-1] - 1) // 2, x.shape[-1] // 2]].sum(-1) / 2,
+    "mean": lambda x: x.mean(-1),
+    "geometric_mean": lambda x: x.log().mean(-1).exp(),
+}
 
 
 class Interval(NamedTuple):
@@ -63,7 +67,7 @@ def interval_over_scenes(
     if statistic not in _STATISTICS:
         raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(_STATISTICS)}")
     defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
-    reduce = {"median": _median, "mean": _mean, "geometric_mean": _geometric_mean}[statistic]
+    reduce = _STATISTICS[statistic]
     return interval_of_statistic(
         lambda index: reduce(defined[index]), defined.numel(), level=level, draws=draws, seed=seed
     )
@@ -107,16 +111,3 @@ def interval_of_statistic(
 def resample_scenes(n: int, draws: int, *, seed: int = 0) -> Tensor:
     """Indices (draws, n) of scenes drawn with replacement, for statistics other than a mean or median of values."""
     return torch.randint(n, (draws, n), generator=torch.Generator().manual_seed(seed))
-
-
-def _median(x: Tensor) -> Tensor:
-    ordered, n = x.sort(-1).values, x.shape[-1]
-    return (ordered[:, (n - 1) // 2] + ordered[:, n // 2]) / 2
-
-
-def _mean(x: Tensor) -> Tensor:
-    return x.mean(-1)
-
-
-def _geometric_mean(x: Tensor) -> Tensor:
-    return x.log().mean(-1).exp()

@@ -12,16 +12,6 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
 from dhtorch.metrics.grouped import N_STRETCHES, covariance_of_mean
 
-#: Limits the measured length of a path over its own from below, without unit. Source: chosen, far from what passes.
-_LEAST_RATIO = 0.1
-
-#: Fewest stretches of a standard deviation. Source: chosen, two differences.
-_MIN_STRETCHES = 3
-
-#: Steps of a robust fit, a count, and the least median residual, in standard deviations: exact copies of a path have
-#: none. Source: as Huber's mean in :mod:`dhtorch.metrics.grouped`; rounding.
-_FIT_STEPS, _LEAST_DISTANCE = 20, 1e-9
-
 
 def align_camera_paths(
     own: np.ndarray,  # (F, 4, 4) camera to world, m
@@ -98,7 +88,7 @@ def compare_motions(
     """
     first, second, T, cov = motions
     n_stretches = int((len(c2w) - 1) // np.median(second - first)) if len(T) else 0
-    if min(n_stretches, len(T)) < _MIN_STRETCHES:
+    if min(n_stretches, len(T)) < 3:
         return None
     between = np.linalg.inv(c2w[second]) @ c2w[first]
     turn = T[:, :3, :3] @ between[:, :3, :3].transpose(0, 2, 1)
@@ -112,13 +102,13 @@ def compare_motions(
     fits = [_fit_stretches(columns, off, cov, parts) for columns in (step, curl)]
     rests = [off - columns @ x for columns, (x, _) in zip((step, curl), fits, strict=True)]
     distances = [np.sqrt((rest * _solve(cov, rest)).sum(1)) for rest in rests]
-    unit = max(min(np.median(d) for d in distances), _LEAST_DISTANCE)
+    unit = max(min(np.median(d) for d in distances), 1e-9)
     is_curl = bool(np.diff([np.log1p((d / unit) ** 2).sum() for d in distances])[0] < 0)
     rest, cross = rests[is_curl], cov[:, :3, 3:]
     shift = rest[:, 3:] - _times(cross.transpose(0, 2, 1), _solve(cov[:, :3, :3], rest[:, :3]))
     turned = rest[:, :3] - _times(cross, _solve(cov[:, 3:, 3:], rest[:, 3:]))
     (change, change_sigma), (angles, angle_sigma) = fits
-    length = 1 / max(1 + float(change[0]), _LEAST_RATIO)
+    length = 1 / max(1 + float(change[0]), 0.1)
     return PathDifference(
         length=length,
         length_sigma=length * change_sigma,
@@ -144,12 +134,12 @@ def _robust_fit(columns: np.ndarray, y: np.ndarray, cov: np.ndarray) -> np.ndarr
     least squares with Cauchy's kernel, which bends at the median distance."""
     W = np.linalg.inv(cov)
     weight = np.ones(len(y))
-    for _ in range(_FIT_STEPS):
+    for _ in range(20):
         A = columns.transpose(0, 2, 1) @ W * weight[:, None, None]
         x = np.linalg.solve((A @ columns).sum(0), _times(A, y).sum(0))
         rest = y - columns @ x
         square = (rest * _times(W, rest)).sum(1)
-        weight = 1 / (1 + square / max(float(np.median(square)), _LEAST_DISTANCE**2))
+        weight = 1 / (1 + square / max(float(np.median(square)), 1e-18))  # exact copies of a path have no residual
     return x
 
 

@@ -37,21 +37,15 @@ def mean_changes(
     changes, parts = [], [(0, x.shape[1])]
     while parts:
         low, high = parts.pop()
-        place, gain = _best_split(x[:, low:high])
-        if place is not None and gain > limit:
-            changes.append((low, low + place, high))
-            parts += [(low, low + place), (low + place, high)]
+        n = high - low
+        if n < 2 * MIN_SEGMENT:
+            continue
+        k = torch.arange(MIN_SEGMENT, n - MIN_SEGMENT + 1)
+        sums = x[:, low:high].cumsum(1)
+        left, right = sums[:, k - 1] / k, (sums[:, -1:] - sums[:, k - 1]) / (n - k)
+        gain = (right - left).square().sum(0) * (k * (n - k) / n)
+        if float(gain.max()) > limit:
+            place = low + int(k[int(gain.argmax())])
+            changes.append((low, place, high))
+            parts += [(low, place), (place, high)]
     return sorted(changes, key=lambda change: change[1])
-
-
-def _best_split(x: Tensor) -> tuple[int | None, float]:
-    """Where the means of unit-noise series (free, n) differ most, and the squared length of that difference."""
-    n = x.shape[1]
-    if n < 2 * MIN_SEGMENT:
-        return None, 0.0
-    k = torch.arange(MIN_SEGMENT, n - MIN_SEGMENT + 1)
-    sums = x.cumsum(1)
-    left, right = sums[:, k - 1] / k, (sums[:, -1:] - sums[:, k - 1]) / (n - k)
-    gain = (right - left).square().sum(0) * (k * (n - k) / n)
-    best = int(gain.argmax())
-    return int(k[best]), float(gain[best])

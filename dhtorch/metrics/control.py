@@ -24,12 +24,6 @@ from torch import Tensor
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.risk import cap_error
 
-#: Fewest scenes from which the spread of their risks is estimated.
-_MIN_SCENES_FOR_SPREAD = 5
-
-#: Largest number of thresholds tried; of more distinct scores, evenly spaced ones are used.
-_MAX_THRESHOLDS = 4096
-
 
 @dataclass(frozen=True)
 class ScoreThreshold:
@@ -69,17 +63,13 @@ def plug_in_threshold(scenes: Sequence[Points], target: float) -> ScoreThreshold
     Raises:
         ValueError: a target outside (0, 1).
     """
-    scenes = _check_scenes(scenes, target)
-    answers = [_sort_losses(scene) for scene in scenes]
-    thresholds = _candidate_thresholds(answers)
-    loss, answered = _accepted_losses(answers, thresholds)
+    thresholds, loss, answered, sizes = _accepted_losses(scenes, target)
     risk = loss / answered.clamp_min(1)
-    coverage = answered / _candidate_counts(scenes)
-    n = len(scenes)
+    n = len(risk)
     mean = risk.sum(0) / max(n, 1)
     variance = (risk - mean).square().sum(0) / (n - 1) if n > 1 else torch.full_like(thresholds, torch.inf)
     bound = mean + (variance / max(n, 1)).sqrt()
-    return _lowest_feasible(thresholds, bound <= target, bound, risk, coverage, target=target)
+    return _lowest_feasible(thresholds, bound <= target, bound, risk, answered / sizes, target=target)
 
 
 def scene_quantile_threshold(
@@ -90,7 +80,7 @@ def scene_quantile_threshold(
     A mean over scenes may meet the target although half of the scenes do not. Here, of n scenes share · (n + 1),
     rounded up, must meet it, so that of n + 1 exchangeable ones the fraction ``share`` does. Where that is more than n,
     all n must, and the bound from their spread as well: mean + t · s · √(1 + 1/n), which the risk of one more scene
-    exceeds with probability 1 − share if the risks are normal. With fewer than :data:`_MIN_SCENES_FOR_SPREAD` scenes
+    exceeds with probability 1 − share if the risks are normal. With fewer than five scenes
     no spread is estimated, and it is only required that all meet the target.
 
     Args:
@@ -107,17 +97,23 @@ def scene_quantile_threshold(
     """
     if not 0 < share <= 1:
         raise ValueError(f"control.share: found {share}, expected a number above 0, at most 1")
-    scenes = _check_scenes(scenes, target)
-    answers = [_sort_losses(scene) for scene in scenes]
-    thresholds = _candidate_thresholds(answers)
-    loss, answered = _accepted_losses(answers, thresholds)
-    risk = loss / answered.clamp_min(1)
+    thresholds, loss, answered, sizes = _accepted_losses(scenes, target)
+    risk, n = loss / answered.clamp_min(1), len(loss)
     kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
-    needed = math.ceil(share * (len(scenes) + 1) - 1e-9)
-    fits = kept * len(scenes) >= min(needed, len(scenes)) - 1e-6
-    if needed > len(scenes) >= _MIN_SCENES_FOR_SPREAD and share < 1:
-        fits = fits & (_next_scene_bound(risk, answered >= max(few, 1), share) <= target)
-    return _lowest_feasible(thresholds, fits, kept, risk, answered / _candidate_counts(scenes), target=target)
+    needed = math.ceil(share * (n + 1) - 1e-9)
+    fits = kept * n >= min(needed, n) - 1e-6
+    if needed > n >= 5 and share < 1:
+        counted = answered >= max(few, 1)
+        n_counted = counted.sum(0)
+        freedom = (n_counted - 1).clamp_min(1)
+        mean = torch.where(counted, risk, 0.0).sum(0) / n_counted.clamp_min(1)
+        variance = torch.where(counted, (risk - mean).square(), 0.0).sum(0) / freedom
+        # Student's t by its expansion around the normal quantile (Abramowitz and Stegun 1964, 26.7.5)
+        z = NormalDist().inv_cdf(share)
+        t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom.square())
+        bound = mean + t * (variance * (1 + 1 / n_counted.clamp_min(1))).sqrt()
+        fits = fits & (n_counted > 1) & (bound <= target)
+    return _lowest_feasible(thresholds, fits, kept, risk, answered / sizes, target=target)
 
 
 def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> ScoreThreshold:
@@ -144,12 +140,8 @@ def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: 
     Source: A. Angelopoulos et al., "Conformal risk control", 2024; S. Bates et al., "Distribution-free,
     risk-controlling prediction sets", 2021 (with confidence).
     """
-    scenes = _check_scenes(scenes, target)
-    answers = [_sort_losses(scene) for scene in scenes]
-    thresholds = _candidate_thresholds(answers)
-    loss, answered = _accepted_losses(answers, thresholds)
-    sizes, n = _candidate_counts(scenes), len(scenes)
-    risk = loss / sizes
+    thresholds, loss, answered, sizes = _accepted_losses(scenes, target)
+    risk, n = loss / sizes, len(loss)
     needed = scenes_needed(target, confidence=confidence)
     # The loss does not rise with the threshold, nor do its bounds: every threshold above a feasible one is feasible.
     if confidence is None:
@@ -157,26 +149,18 @@ def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: 
         fits = bound <= target
     else:
         bound = torch.full_like(thresholds, 1 - confidence)
-        fits = risk.sum(0) / max(n, 1) <= _largest_mean(n, target, 1 - confidence)
+        # The largest mean loss whose p-value is small enough, up to rounding and never above.
+        low, high = 0.0, target
+        for _ in range(60):
+            middle = (low + high) / 2
+            small = _hoeffding_bentkus_p_value(middle, n, target) <= 1 - confidence
+            low, high = (middle, high) if small else (low, middle)
+        possible = _hoeffding_bentkus_p_value(0.0, n, target) <= 1 - confidence
+        fits = possible & (risk.sum(0) / max(n, 1) <= low)
     fits = fits & (n >= needed)
     return _lowest_feasible(
         thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence
     )
-
-
-def _next_scene_bound(risk: Tensor, counted: Tensor, share: float) -> Tensor:
-    """Risk (thresholds,) that one more scene stays below with probability ``share``, for normal risks.
-
-    Estimated from the ``counted`` (scenes, thresholds); infinite with fewer than two.
-    """
-    n = counted.sum(0)
-    mean = torch.where(counted, risk, 0.0).sum(0) / n.clamp_min(1)
-    variance = torch.where(counted, (risk - mean).square(), 0.0).sum(0) / (n - 1).clamp_min(1)
-    z = NormalDist().inv_cdf(share)
-    freedom = (n - 1).clamp_min(1)
-    # Student's t by its expansion around the normal quantile (Abramowitz and Stegun 1964, 26.7.5)
-    t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom.square())
-    return torch.where(n > 1, mean + t * (variance * (1 + 1 / n.clamp_min(1))).sqrt(), torch.inf)
 
 
 def scenes_needed(target: float, *, confidence: float | None = None) -> int:
@@ -197,42 +181,37 @@ def _hoeffding_bentkus_p_value(mean: float, n: int, target: float) -> float:
 
     Losses lie in [0, 1] and are independent.
     """
-    if n == 0 or mean >= target:
+    if mean >= target:
         return 1.0
     divergence = (1 - mean) * math.log((1 - mean) / (1 - target))
     divergence += mean * math.log(mean / target) if mean > 0 else 0.0
-    bentkus = math.e * _binomial_cdf(math.ceil(n * mean - 1e-9), n, target)
-    return min(1.0, math.exp(-n * divergence), bentkus)
+    # P(X ≤ k) of a binomial, summed from logarithms
+    k = math.ceil(n * mean - 1e-9)
+    whole, log, log_1 = math.lgamma(n + 1), math.log(target), math.log1p(-target)
+    terms = (whole - math.lgamma(i + 1) - math.lgamma(n - i + 1) + i * log + (n - i) * log_1 for i in range(k + 1))
+    tail = 1.0 if k >= n else min(1.0, math.fsum(math.exp(t) for t in terms))
+    return min(1.0, math.exp(-n * divergence), math.e * tail)
 
 
-def _sort_losses(scene: Points) -> tuple[Tensor, Tensor]:
-    """Scores of a scene's answers, rising, and the sum of the capped errors of the first 0, 1, … of them."""
-    score, order = scene.score[scene.keep].sort()
-    loss = cap_error(scene.error[scene.keep])[order]
-    return score, torch.cat((loss.new_zeros(1), loss.cumsum(0)))
-
-
-def _accepted_losses(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum of the capped errors of the accepted answers, and their number: (scenes, thresholds) each."""
-    empty = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
-    loss, count = [empty], [empty]
-    for score, total in answers:
+def _accepted_losses(scenes: Sequence[Points], target: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Distinct scores of all answers, rising (T,): all of them, or 4096 evenly spaced ones if they are more. Of the S
+    scenes with candidates the sum of the capped errors of the answers accepted at each (S, T), their number (S, T), and
+    the number of candidates (S, 1)."""
+    _check_probability("target", target)
+    scenes = [s for s in scenes if s.keep.numel()]
+    answers = [(scene.score[scene.keep].sort(), cap_error(scene.error[scene.keep])) for scene in scenes]
+    thresholds = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for (score, _), _ in answers)]).unique()
+    n = thresholds.numel()
+    if n > 4096:
+        thresholds = thresholds[torch.linspace(0, n - 1, 4096, dtype=torch.float64).round().long()]
+        n = 4096
+    loss, count = torch.zeros(len(scenes), n, dtype=torch.float64), torch.zeros(len(scenes), n, dtype=torch.int64)
+    for k, ((score, order), error) in enumerate(answers):
+        total = torch.cat((error.new_zeros(1), error[order].cumsum(0)))
         below = torch.searchsorted(score, thresholds)
-        loss.append((total[-1] - total[below])[None])
-        count.append((score.numel() - below)[None])
-    return torch.cat(loss).clamp_min(0), torch.cat(count)
-
-
-def _candidate_thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Distinct scores of the answers, rising: all of them, or evenly spaced ones if they are too many."""
-    scores = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for score, _ in answers)]).unique()
-    if scores.numel() > _MAX_THRESHOLDS:
-        scores = scores[torch.linspace(0, scores.numel() - 1, _MAX_THRESHOLDS, dtype=torch.float64).round().long()]
-    return scores
-
-
-def _candidate_counts(scenes: Sequence[Points]) -> Tensor:
-    return torch.tensor([s.keep.numel() for s in scenes], dtype=torch.float64)[:, None]
+        loss[k], count[k] = total[-1] - total[below], score.numel() - below
+    sizes = torch.tensor([s.keep.numel() for s in scenes], dtype=torch.float64)[:, None]
+    return thresholds, loss.clamp_min(0), count, sizes
 
 
 def _lowest_feasible(
@@ -261,33 +240,6 @@ def _lowest_feasible(
     )
 
 
-def _check_scenes(scenes: Sequence[Points], target: float) -> list[Points]:
-    _check_probability("target", target)
-    return [s for s in scenes if s.keep.numel()]
-
-
 def _check_probability(name: str, value: float) -> None:
     if not 0 < value < 1:
         raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
-
-
-def _largest_mean(n: int, target: float, level: float) -> float:
-    """Largest mean loss whose p-value is at most ``level``, up to rounding and never above; −1 if there is none."""
-    if _hoeffding_bentkus_p_value(0.0, n, target) > level:
-        return -1.0
-    low, high = 0.0, target
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if _hoeffding_bentkus_p_value(middle, n, target) <= level else (low, middle)
-    return low
-
-
-def _binomial_cdf(k: int, n: int, p: float) -> float:
-    """P(X ≤ k) of a binomial, summed from logarithms."""
-    if k >= n:
-        return 1.0
-    terms = (
-        math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) + i * math.log(p) + (n - i) * math.log1p(-p)
-        for i in range(k + 1)
-    )
-    return min(1.0, math.fsum(math.exp(t) for t in terms))

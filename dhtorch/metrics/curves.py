@@ -10,9 +10,6 @@ import torch
 from dhtorch.metrics import reliability, risk
 from dhtorch.metrics.errors import Points
 
-#: Number of points of a risk–coverage curve, and of bins of the other two curves.
-_N_CURVE_POINTS, _N_BINS = 20, 10
-
 
 def sample_curves(pooled: Points) -> dict[str, Any]:
     """Risk–coverage, error-over-distance and reliability curves of one scene, as lists of equal length.
@@ -27,41 +24,32 @@ def sample_curves(pooled: Points) -> dict[str, Any]:
     answered = pooled.answered()
     n = answered.keep.numel()
     order = answered.score.argsort(descending=True, stable=True)
-    rank = torch.tensor(
-        sorted({max(1, round(n * (k + 1) / _N_CURVE_POINTS)) for k in range(_N_CURVE_POINTS)}) if n else [],
-        dtype=torch.long,
-    )
+    rank = torch.tensor(sorted({max(1, round(n * k / 20)) for k in range(1, 21)}) if n else [], dtype=torch.long)
     coverage, mean = risk.risk_coverage(pooled)
     _, oracle = risk.risk_coverage(pooled, oracle=True)
     ranked = answered.error[order]
-    return {
-        "risk_coverage": {
-            "coverage": _round_digits(coverage[rank - 1].tolist()),
-            "risk": _round_digits(mean[rank - 1].tolist()),
-            "oracle": _round_digits(oracle[rank - 1].tolist()),
-            "score": _round_digits(answered.score[order][rank - 1].tolist()),
-            "median_rel": _round_digits([float(ranked[:k].quantile(0.5)) for k in rank.tolist()]),
-        },
-        "distance": _by_distance(pooled),
-        "reliability": _reliability(pooled),
-    }
-
-
-def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
-    bins = torch.tensor_split(pooled.true_depth.argsort(stable=True), min(_N_BINS, pooled.true_depth.numel()) or 1)
-    curves: dict[str, list[float | None]] = {"depth": [], "coverage": [], "median_rel": []}
-    for index in bins if pooled.true_depth.numel() else ():
+    diagram = reliability.reliability_diagram(*reliability.pool_answers([pooled]))
+    distance: dict[str, list[float | None]] = {"depth": [], "coverage": [], "median_rel": []}
+    n_candidates = pooled.true_depth.numel()
+    bins = torch.tensor_split(pooled.true_depth.argsort(stable=True), min(10, n_candidates) or 1)
+    for index in bins if n_candidates else ():
         points: Points = pooled[index]
         error = points.answered().error
-        curves["depth"].append(float(points.true_depth.quantile(0.5)))
-        curves["coverage"].append(float(points.keep.double().mean()))
-        curves["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
-    return {name: _round_digits(values) for name, values in curves.items()}
-
-
-def _reliability(pooled: Points) -> dict[str, list[float | None]]:
-    table = reliability.reliability_diagram(*reliability.pool_answers([pooled]), bins=_N_BINS)
-    return {name: _round_digits(getattr(table, name).tolist()) for name in ("claimed", "realised", "weight")}
+        distance["depth"].append(float(points.true_depth.quantile(0.5)))
+        distance["coverage"].append(float(points.keep.double().mean()))
+        distance["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
+    curves = {
+        "risk_coverage": {
+            "coverage": coverage[rank - 1].tolist(),
+            "risk": mean[rank - 1].tolist(),
+            "oracle": oracle[rank - 1].tolist(),
+            "score": answered.score[order][rank - 1].tolist(),
+            "median_rel": [float(ranked[:k].quantile(0.5)) for k in rank.tolist()],
+        },
+        "distance": distance,
+        "reliability": {name: getattr(diagram, name).tolist() for name in ("claimed", "realised", "weight")},
+    }
+    return {name: {k: _round_digits(v) for k, v in curve.items()} for name, curve in curves.items()}
 
 
 def _round_digits(values: list[float | None]) -> list[float | None]:

@@ -23,9 +23,6 @@ from dhtorch.records import Estimate
 #: Metric name → value, None where undefined.
 MetricValues = dict[str, float | None]
 
-#: Keys that identify a row of a result; they are not metrics.
-_ROW_KEYS = ("scene", "pair", "method")
-
 #: Relative error above which an answer is a gross error.
 GROSS_ERROR_REL = 0.2
 
@@ -193,7 +190,7 @@ def _flatten(row: Mapping[str, Any], prefix: str = "") -> dict[str, float | None
     for key, value in row.items():
         if isinstance(value, Mapping):
             flat |= _flatten(value, f"{prefix}{key}.")
-        elif key in _ROW_KEYS:
+        elif key in ("scene", "pair", "method"):  # they identify a row of a result
             continue
         elif value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
             flat[prefix + key] = value

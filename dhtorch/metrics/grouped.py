@@ -4,31 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Standard deviation of a normal variable per median absolute deviation. Source: derived, 1 / Phi^-1(3/4).
-SIGMA_OF_MAD = 1.4826
-
-#: Deviation, in standard deviations, at which Huber's mean bends. Source: origin not recorded.
-_HUBER_BEND = 1.5
-
-#: Stretches of a recording within which errors are common, a count. Source: origin not recorded.
+#: Stretches of a recording within which errors are common: as many as the jackknife over them takes.
 N_STRETCHES = 8
 
 
 def mad_sigma(
     x: np.ndarray,  # (n, …)
 ) -> np.ndarray:
-    """Standard deviation (…) along the first axis from the median absolute deviation."""
-    return SIGMA_OF_MAD * np.median(np.abs(x - np.median(x, 0)), 0)
+    """Standard deviation (…) along the first axis from the median absolute deviation, of normal values: 1 / Phi^-1(3/4)
+    times that."""
+    return 1.4826 * np.median(np.abs(x - np.median(x, 0)), 0)
 
 
 def huber_mean(
     x: np.ndarray,  # (n,)
     sigma: np.ndarray,  # (n,)
 ) -> float:
-    """Huber's mean of values with standard deviations; NaN of none."""
+    """Huber's mean of values with standard deviations, bent at 1.5 of these; NaN of none."""
     mean = float(np.median(x)) if len(x) else np.nan
     for _ in range(20):
-        weight = 1 / (sigma * np.maximum(sigma, np.abs(x - mean) / _HUBER_BEND))
+        weight = 1 / (sigma * np.maximum(sigma, np.abs(x - mean) / 1.5))
         mean = float((weight * x).sum() / weight.sum()) if len(x) else np.nan
     return mean
 

@@ -13,21 +13,15 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Flag, first_reason, names
+from dhtorch.codes import Flag, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import extract_patches, round_half_up, sample_nearest
 from dhtorch.pytree import Record, record
 from dhtorch.records import MIN_TRACKABILITY, Frame, Samples
 
-#: Levels of the truth test, from none to all of it.
-_TRUTH_TESTS = ("raw", "5x5", "full")
-
-#: Side of the close window of a dense map, px; of the close and of the wide window of a sparse map, px.
-_CLOSE_WINDOW_PX, SPARSE_CLOSE_WINDOW_PX, _SPARSE_WIDE_WINDOW_PX = 5, 7, 15
-
-#: Spread (max / min − 1) of the returns from which the close and the wide window fail.
-_MAX_CLOSE_SPREAD, _MAX_WIDE_SPREAD = 0.05, 0.15
+#: Side of the close window of a sparse map, px.
+SPARSE_CLOSE_WINDOW_PX = 7
 
 
 class TruthCode:
@@ -57,16 +51,14 @@ class Truth(Record):
 
     def dropped(self) -> dict[str, int]:
         """Number of held-back returns rejected by each rule: the metric ``n_dropped``."""
-        return {names(TruthCode)[code].lower(): int((self.code == code).sum()) for code in _REJECTING_RULES}
+        rules = {"close": TruthCode.CLOSE, "wide": TruthCode.WIDE}
+        rules |= {"excluded": TruthCode.EXCLUDED, "texture": TruthCode.TEXTURE}
+        return {name: int((self.code == code).sum()) for name, code in rules.items()}
 
     @property
     def n_real_holes(self) -> int:
         """Number of samples with truth at which the sensor has no return: they are in no range-split cohort."""
         return int((self.code == TruthCode.REAL_HOLE).sum())
-
-
-#: Codes of held-back returns that are rejected.
-_REJECTING_RULES = (TruthCode.CLOSE, TruthCode.WIDE, TruthCode.EXCLUDED, TruthCode.TEXTURE)
 
 
 def truth_kept_ratio(n_candidates: int, n_dropped: Mapping[str, int]) -> float | None:
@@ -180,8 +172,8 @@ def sample_truth(
     Cost: reads window² depth pixels per sample, whatever the image size.
     """
     sizes = check("sample_truth", image=(frame.image, "B C H W"), depth=(frame.depth, "B h w"), uv=(uv, "B N 2"))
-    if truth not in _TRUTH_TESTS:
-        raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(_TRUTH_TESTS)}")
+    if truth not in ("raw", "5x5", "full"):
+        raise ValueError(f"holdout.truth: found {truth!r}, expected one of raw, 5x5, full")
     scale = sizes["w"] / sizes["W"]
     pixel = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
     dense = _test_truth(frame.depth, pixel, truth, scale, window)
@@ -194,20 +186,25 @@ def sample_truth(
 
 def _test_truth(depth: Tensor, place: Tensor, truth: str, scale: float, window: int | None) -> tuple[Tensor, Tensor]:
     """The return (B, N) and its code at pixels ``place`` of maps (B, h, w); ``window`` None: the maps are sparse."""
-    close, u, v = _window_returns(
-        depth, place, _window_side(SPARSE_CLOSE_WINDOW_PX if window is None else _CLOSE_WINDOW_PX, scale)
-    )
-    returned = _nearest_return(close, u, v, place) if window is None else _nearest_pixel(depth, place)
+    # Odd sides, at least 3, of windows stated in image pixels, in a map ``scale`` times as wide as the image
+    sizes = (SPARSE_CLOSE_WINDOW_PX, 15) if window is None else (5, window)
+    sides = [max(3, 2 * int(size * scale / 2) + 1) for size in sizes]
+    close, u, v = _window_returns(depth, place, sides[0])
+    if window is None:
+        du, dv = u - place[..., 0, None].detach(), v - place[..., 1, None].detach()
+        distance = ((du * du)[..., None, :] + (dv * dv)[..., :, None]).flatten(-2)
+        returns = close.flatten(-2)
+        far = torch.where(returns > 0, distance, torch.full_like(distance, torch.inf))
+        returned = returns.gather(-1, far.argmin(-1, keepdim=True))[..., 0]
+    else:
+        returned = _nearest_pixel(depth, place)
     fails_close, fails_wide = torch.zeros_like(returned, dtype=torch.bool), torch.zeros_like(returned, dtype=torch.bool)
     if truth != "raw":
-        fails_close = _is_spread(close, _MAX_CLOSE_SPREAD)
+        fails_close = _is_spread(close, 0.05)
         if window is not None:
             fails_close = fails_close | (close <= 0).flatten(-2).any(-1)
     if truth == "full":
-        wide, _, _ = _window_returns(
-            depth, place, _window_side(_SPARSE_WIDE_WINDOW_PX if window is None else window, scale)
-        )
-        fails_wide = _is_spread(wide, _MAX_WIDE_SPREAD)
+        fails_wide = _is_spread(_window_returns(depth, place, sides[1])[0], 0.15)
     code = first_reason(
         (returned <= 0, TruthCode.NO_RETURN), (fails_close, TruthCode.CLOSE), (fails_wide, TruthCode.WIDE)
     )
@@ -338,11 +335,6 @@ def select_real_holes(
     return truth.replace(code=code)
 
 
-def _window_side(size: int, scale: float) -> int:
-    """Odd side, at least 3, of a window of ``size`` image pixels in a map ``scale`` times as wide as the image."""
-    return max(3, 2 * int(size * scale / 2) + 1)
-
-
 def _window_returns(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns (B, N, size, size) around depth pixels ``place`` (B, N, 2), 0 = none, and the u and v (B, N, size) of
     the window's columns and rows.
@@ -366,15 +358,6 @@ def _window_returns(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Te
 def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
     value, inside = sample_nearest(depth, place)
     return torch.where(inside & value.isfinite() & (value > 0), value, torch.zeros_like(value))
-
-
-def _nearest_return(window: Tensor, u: Tensor, v: Tensor, place: Tensor) -> Tensor:
-    """The return (B, N) of a window nearest to ``place``, 0 where there is none."""
-    du, dv = u - place[..., 0, None].detach(), v - place[..., 1, None].detach()
-    distance = ((du * du)[..., None, :] + (dv * dv)[..., :, None]).flatten(-2)
-    returns = window.flatten(-2)
-    far = torch.where(returns > 0, distance, torch.full_like(distance, torch.inf))
-    return returns.gather(-1, far.argmin(-1, keepdim=True))[..., 0]
 
 
 def _is_spread(window: Tensor, limit: float) -> Tensor:

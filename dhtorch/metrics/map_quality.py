@@ -17,14 +17,6 @@ from dhtorch.records import DepthMap
 #: Source: chosen on maps of 640 x 480, as the least patch that is seen as one.
 SPECK_PX = 30
 
-#: Ratio of the depths of neighbours, farther over nearer, above which they lie on two surfaces.
-#: Source: derived, three times the spread that the truth test allows (5 %).
-STEP_RATIO = 1.15
-
-#: Distance from a true depth step within which an answer lies beside it, px of the map along rows and columns.
-#: Source: derived, the radius of the matched window and two pixels around it.
-STEP_RADIUS_PX = 6
-
 
 class Artefacts(NamedTuple):
     """Pixels of a map that are artefacts, (B, h, w) bool each. A pixel may be a speck and a line."""
@@ -56,11 +48,12 @@ def artefact_counts(depth_map: DepthMap) -> tuple[int, int]:
     return int((speck | line | pinhole).sum()), int((depth_map.keep & is_estimated(depth_map.source)).sum())
 
 
-def near_depth_step(depth: Tensor, ratio: float = STEP_RATIO, radius: int = STEP_RADIUS_PX) -> Tensor:
+def near_depth_step(depth: Tensor, ratio: float = 1.15, radius: int = 6) -> Tensor:
     """Pixels (B, h, w) bool of a true depth map (B, h, w) m, 0 = none, within ``radius`` px of a depth step.
 
     A step lies in a window of 3 × 3 pixels whose farthest depth exceeds ``ratio`` times its nearest one; pixels without
-    depth do not count.
+    depth do not count. By default the ratio is three times the spread that the truth test allows (5 %), and the radius
+    that of the matched window and two pixels around it.
     """
     far = F.max_pool2d(depth[:, None], 3, 1, 1)
     inverse = torch.where(depth > 0, 1 / depth.clamp_min(torch.finfo(depth.dtype).tiny), 0.0)

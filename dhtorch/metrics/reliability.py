@@ -62,7 +62,13 @@ def reliability_diagram(
         raise ValueError(f"reliability: found bins={bins}, expected at least 1")
     claimed = claimed.double().clamp(0, 1)
     weight = torch.ones_like(claimed) if weight is None else weight.double()
-    position = _mass_below(claimed, weight) if equal_mass else claimed
+    position = claimed
+    if equal_mass:  # fraction of the weight below each claim, plus half the weight of its equals
+        order = claimed.argsort(stable=True)
+        _, group, size = claimed[order].unique_consecutive(return_inverse=True, return_counts=True)
+        mass = torch.zeros(size.numel()).to(claimed).index_add(0, group, weight[order])
+        middle = (mass.cumsum(0) - mass / 2) / mass.sum().clamp_min(torch.finfo(mass.dtype).tiny)
+        position = torch.zeros_like(claimed).index_copy(0, order, middle[group])
     index = (position * bins).long().clamp(max=bins - 1)
 
     def total(x: Tensor) -> Tensor:
@@ -148,12 +154,3 @@ def leave_one_room_out(
     for left_out in dict.fromkeys(room.values()):
         others = {name: s for name, s in scenes.items() if room[name] != left_out}
         yield others, {name: s for name, s in scenes.items() if room[name] == left_out}
-
-
-def _mass_below(x: Tensor, weight: Tensor) -> Tensor:
-    """Fraction (n,) of the weight below each value, plus half the weight of its equals: its position in [0, 1]."""
-    order = x.argsort(stable=True)
-    _, group, size = x[order].unique_consecutive(return_inverse=True, return_counts=True)
-    mass = torch.zeros(size.numel(), dtype=x.dtype, device=x.device).index_add(0, group, weight[order])
-    middle = (mass.cumsum(0) - mass / 2) / mass.sum().clamp_min(torch.finfo(x.dtype).tiny)
-    return torch.zeros_like(x).index_copy(0, order, middle[group])

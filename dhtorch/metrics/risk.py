@@ -15,15 +15,6 @@ from torch import Tensor
 from dhtorch.geometry.checks import check
 from dhtorch.metrics.errors import MetricValues, Points
 
-#: Fewest accepted answers of a coverage at a risk.
-_MIN_POINTS = 10
-
-#: Number of equal steps of coverage between which the curve is tested for monotonicity.
-_N_MONOTONICITY_STEPS = 10
-
-#: Least depth of a knee below the chord, in ranges of the risk. Source: chosen, so that rounding makes no knee.
-_MIN_KNEE_DEPTH = 0.01
-
 
 def risk_curve(
     loss: Tensor,  # (n,)
@@ -51,7 +42,7 @@ def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tens
     return _running_count(loss) / max(pooled.keep.numel(), 1), risk_curve(loss, -loss if oracle else answered.score)
 
 
-def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValues:
+def measure_risk(pooled: Points, *, min_points: int = 10) -> MetricValues:
     """Risk metrics of a pair or scene: how well its score orders the answers by error.
 
     Returns:
@@ -83,12 +74,18 @@ def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValu
         "aurc_full": _mean(full),
         "augrc": _mean(_running_sum(loss, score) / max(loss.numel(), 1)),
     }
-    cuts = _ends_of_ties(score)
+    # By falling score: a threshold can lie after an answer where the next score is smaller.
+    ordered = score.sort(descending=True).values
+    cuts = torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
     for percent in (5, 10, 20):
         fits = cuts & (risk <= percent / 100) & (_running_count(loss) >= min_points)
         n_accepted = int(torch.where(fits, _running_count(loss), 0).max()) if has_answers else 0
         numbers[f"coverage_at_{percent}"] = n_accepted / n if n else None
-    numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
+    numbers |= {"monotonicity": None, "largest_fall": None}
+    if len(risk) >= 10:
+        tenths = risk[torch.tensor([len(risk) * k // 10 - 1 for k in range(1, 11)], device=risk.device)]
+        numbers["monotonicity"] = float((tenths.diff() >= -1e-12).double().mean())
+        numbers["largest_fall"] = float((tenths.cummax(0).values - tenths).max())
     return numbers
 
 
@@ -164,7 +161,7 @@ def find_knee(coverage: Sequence[float], risk: Sequence[float]) -> int | None:
     slope = (risk[last] - risk[first]) / width
     below = [risk[first] + slope * (c - coverage[first]) - r for c, r in zip(coverage, risk, strict=True)]
     deepest = max(range(len(below)), key=below.__getitem__)
-    return deepest if below[deepest] > _MIN_KNEE_DEPTH * height else None
+    return deepest if below[deepest] > 0.01 * height else None
 
 
 def cap_error(error: Tensor) -> Tensor:
@@ -183,24 +180,6 @@ def _running_sum(loss: Tensor, score: Tensor) -> Tensor:
 
 def _running_count(loss: Tensor) -> Tensor:
     return torch.arange(1, loss.numel() + 1, dtype=torch.float64, device=loss.device)
-
-
-def _ends_of_ties(score: Tensor) -> Tensor:
-    """(n,) bool, by falling score: a threshold can lie after this answer, because the next score is smaller."""
-    ordered = score.sort(descending=True).values
-    return torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
-
-
-def _monotonicity(risk: Tensor) -> tuple[float | None, float | None]:
-    n = risk.numel()
-    if n < _N_MONOTONICITY_STEPS:
-        return None, None
-    rank = torch.tensor(
-        [n * k // _N_MONOTONICITY_STEPS - 1 for k in range(1, _N_MONOTONICITY_STEPS + 1)], device=risk.device
-    )
-    tenths = risk[rank]
-    fall = (tenths.cummax(0).values - tenths).max()
-    return float((tenths.diff() >= -1e-12).double().mean()), float(fall)
 
 
 def _mean(x: Tensor) -> float | None:

@@ -12,7 +12,6 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from dhtorch.metrics.errors import MetricValues, Points
 from dhtorch.metrics.risk import ause, measure_risk
@@ -20,12 +19,6 @@ from dhtorch.records import Estimate, depth_interval
 
 #: Ratio of the far to the near end of a range bin. Source: derived, 1.25 = ten bins a decade.
 RANGE_BIN_RATIO = 1.25
-
-#: Fewest answers of a range bin whose bias is read, a count. Source: the requirement, stated before the measurements.
-MIN_BIN_ANSWERS = 200
-
-#: Square of a standard normal variable that half of the draws exceed.
-_MEDIAN_SQUARE = 0.4549364231195724
 
 
 class RangeBias(NamedTuple):
@@ -38,7 +31,7 @@ class RangeBias(NamedTuple):
     mean: float  # mean of the same, each at most 1 in size
 
 
-def range_bias(points: Points, *, min_answers: int = MIN_BIN_ANSWERS) -> list[RangeBias]:
+def range_bias(points: Points, *, min_answers: int = 200) -> list[RangeBias]:
     """Bias in bins of true depth with edges at powers of :data:`RANGE_BIN_RATIO` m, from near to far.
 
     Bins with fewer than ``min_answers`` answers are left out. Bins of the *estimated* depth would show a bias without
@@ -97,14 +90,12 @@ def disjoint_agreement(one: Estimate, other: Estimate, *, min_answers: int = 20)
     both = one.keep & other.keep & (one.sigma > 0) & (other.sigma > 0)
     if int(both.sum()) < min_answers:
         return DisjointAgreement(None, None, int(both.sum()))
-    (q, variance), (p, other_variance) = (_independent_part(x, both) for x in (one, other))
+    parts = []
+    for estimate in (one, other):
+        depth = estimate.depth[both].double()
+        variance = (estimate.sigma.square() - estimate.budget.reference)[both].double()
+        parts.append((1 / depth, (variance / depth.square().square()).clamp_min(torch.finfo(torch.float64).tiny)))
+    (q, variance), (p, other_variance) = parts
     square = (q - p).square() / (variance + other_variance)
-    return DisjointAgreement(float(square.mean()), float(square.median()) / _MEDIAN_SQUARE, square.numel())
-
-
-def _independent_part(estimate: Estimate, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse depth and its variance without the reference term, of the masked samples, float64."""
-    depth = estimate.depth[mask].double()
-    variance = (estimate.sigma.square() - estimate.budget.reference)[mask].double()
-    tiny = torch.finfo(torch.float64).tiny
-    return 1 / depth, (variance / depth.square().square()).clamp_min(tiny)
+    # 0.45…: the square of a standard normal variable that half of the draws exceed
+    return DisjointAgreement(float(square.mean()), float(square.median()) / 0.4549364231195724, square.numel())

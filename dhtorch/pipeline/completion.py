@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.calibration import load_calibration
-from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Source
+from dhtorch.metrics.calibration import Calibration, load_calibration
 from dhtorch.pipeline.dense import check_dense_options, selected_views, sweep_depth
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.method import Method

@@ -119,7 +119,15 @@ def sweep_views(reference: Frame, selected: SelectedViews, method: MethodSpec, o
     source_views = [
         source_view_of(selected, k, options.size, is_used, base.image) for k, is_used in zip(index, use, strict=True)
     ]
-    nearest = _nearest_depth(selected.samples, reference.sparse, options)
+    # The sweep ends at the sensor's reach: a map without holes has none nearer than that. Between the returns of a
+    # sparse map are holes at every depth: there it ends where only 1 - ``reach_quantile`` of the returns are nearer.
+    depth = torch.where(selected.samples.usable, selected.samples.depth, torch.inf).detach().sort(-1).values
+    n = selected.samples.usable.sum(-1)
+    rank = (options.reach_quantile * (n - 1).clamp_min(0)).long()
+    if reference.sparse is not None:
+        rank = torch.where(reference.sparse, ((1 - options.reach_quantile) * n).long(), rank)
+    reach = depth.gather(-1, rank[:, None])[:, 0]
+    nearest = torch.where(n > 0, options.sweep_overlap * reach, torch.ones_like(reach))
     q = torch.linspace(0, 1, options.planes, device=base.ray.device).to(base.ray) / nearest[:, None].to(base.ray)
     start = surface.sweep_planes(base, source_views, q, options)
     return Sweep(
@@ -140,7 +148,12 @@ def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
     """The swept map (B, h, w) with its gates, before it is filtered by its neighbours."""
     known = sweep.base.known.unflatten(-1, sweep.base.hw)
     returns = sweep.returns.depth.detach(), sweep.returns.sigma.detach(), sweep.returns.usable
-    place, scale_error = (sweep.beyond, sweep.alone), _scale_error(sweep.near)
+    has_sigma = sweep.near.usable & (sweep.near.depth > 0)
+    near_depth = torch.where(has_sigma, sweep.near.depth, torch.ones_like(sweep.near.depth))
+    # The relative error of the metric scale, which affects all pixels alike, is that of the near samples.
+    error = masked_median(sweep.near.sigma / near_depth, has_sigma)
+    scale_error = torch.where(has_sigma.any(-1, keepdim=True), error, 0.0)[:, 0].detach()
+    place = sweep.beyond, sweep.alone
     depth, sigma, score, source, gate, track, pose, reference = _gate(
         *sweep.surface, known, *place, sweep.pair_gate, scale_error, *returns, options=options
     )
@@ -286,21 +299,6 @@ def source_view_of(selected: SelectedViews, index: Tensor, size: int, use: Tenso
     )
 
 
-def _nearest_depth(samples: Samples, sparse: Tensor | None, options: DenseOptions) -> Tensor:
-    """Depth (B,) in m at which the sweep ends; 1 where there are no near returns.
-
-    A map without holes has none nearer than its reach, so the sweep ends there. Between the returns of a ``sparse`` map
-    (B,) are holes at every depth: there the sweep ends where only 1 - ``reach_quantile`` of the returns are nearer.
-    """
-    depth = torch.where(samples.usable, samples.depth, torch.inf).detach().sort(-1).values
-    n = samples.usable.sum(-1)
-    rank = (options.reach_quantile * (n - 1).clamp_min(0)).long()
-    if sparse is not None:
-        rank = torch.where(sparse, ((1 - options.reach_quantile) * n).long(), rank)
-    reach = depth.gather(-1, rank[:, None])[:, 0]
-    return torch.where(n > 0, options.sweep_overlap * reach, torch.ones_like(reach))
-
-
 def _pair_gate(selected: SelectedViews, use: Tensor) -> Tensor:
     """Gate (B,) for all pixels of reference views without a source view to sweep, else ANSWER."""
     no_baseline = (selected.fits.code == PoseCode.NO_BASELINE) | (selected.estimates.gate == Gate.NO_BASELINE).any(-1)
@@ -349,7 +347,19 @@ def _gate(*tensors: Any, options: DenseOptions) -> tuple[Tensor, ...]:
     """
     known, beyond, alone, pair_gate, scale_error, *returns = tensors[5:]
     swept = _gated(known, surface.RefinedSurface(*tensors[:5]), (beyond, alone), pair_gate, options)
-    swept = _check_against_returns(swept, returns, scale_error, options)
+    # CONTRADICTED where near returns refute the map; the metric scale's uncertainty is added to sigma.
+    depth, sigma, usable = returns
+    swept_sigma = swept.sigma.detach()
+    overlap = usable & swept.keep
+    error = (torch.where(overlap, swept.depth.detach() - depth, 0.0)).abs()
+    error_sigma = torch.where(overlap, (swept_sigma.square() + sigma.square()).sqrt(), 1.0)
+    wrong = overlap & (error > options.refuting_sigmas * error_sigma) & (error > options.refuting_ratio * depth)
+    n = overlap.sum((1, 2))
+    refuted = (n >= options.min_overlap_pixels) & (2 * wrong.sum((1, 2)) > n)
+    gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
+    by_sensor = (scale_error[:, None, None] * swept.depth.detach()).square()
+    parts = None if swept.parts is None else swept.parts.replace(reference=by_sensor)
+    swept = swept.replace(sigma=(swept_sigma.square() + by_sensor).sqrt(), gate=gate, parts=parts)
     assert swept.parts is not None
     return (*map_fields(swept), swept.parts.track, swept.parts.pose, swept.parts.reference)
 
@@ -394,35 +404,6 @@ def _returns(reference: Frame, method: MethodSpec, hw: tuple[int, int]) -> Senso
     samples = method.backproject(reference, map_pixel_centres(reference, hw))
     columns = samples.depth, samples.sigma, samples.confidence, samples.usable
     return SensorReturns(*(x.unflatten(1, hw) for x in columns))
-
-
-def _scale_error(near: Samples) -> Tensor:
-    """Relative error (B,) of the metric scale, which affects all pixels alike: it is as uncertain as the near samples
-    (B, N) that it comes from, their median sigma / depth. Gradient: none."""
-    has_sigma = near.usable & (near.depth > 0)
-    error = masked_median(near.sigma / torch.where(has_sigma, near.depth, torch.ones_like(near.depth)), has_sigma)
-    return torch.where(has_sigma.any(-1, keepdim=True), error, 0.0)[:, 0].detach()
-
-
-def _check_against_returns(
-    swept: DepthMap,
-    returns: Sequence[Tensor],  # (B, h, w) depth and sigma in m, usable
-    scale_error: Tensor,  # (B,)
-    options: DenseOptions,
-) -> DepthMap:
-    """The swept map, CONTRADICTED where near returns refute it, with the metric scale's uncertainty added to sigma."""
-    depth, sigma, usable = returns
-    swept_sigma = swept.sigma.detach()
-    overlap = usable & swept.keep
-    error = (torch.where(overlap, swept.depth.detach() - depth, 0.0)).abs()
-    error_sigma = torch.where(overlap, (swept_sigma.square() + sigma.square()).sqrt(), 1.0)
-    wrong = overlap & (error > options.refuting_sigmas * error_sigma) & (error > options.refuting_ratio * depth)
-    n = overlap.sum((1, 2))
-    refuted = (n >= options.min_overlap_pixels) & (2 * wrong.sum((1, 2)) > n)
-    gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
-    by_sensor = (scale_error[:, None, None] * swept.depth.detach()).square()
-    parts = None if swept.parts is None else swept.parts.replace(reference=by_sensor)
-    return swept.replace(sigma=(swept_sigma.square() + by_sensor).sqrt(), gate=gate, parts=parts)
 
 
 def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:

@@ -203,7 +203,10 @@ def _join(
 
     An uncertain answer counts only where it agrees with one of the other kind.
     """
-    one, other = (_select(sure.keep, sure, unsure) for sure, unsure in (sparse, swept))
+    one, other = (
+        _Answers(*(torch.where(sure.keep, x, y.to(x)) for x, y in zip(sure, unsure, strict=True)))
+        for sure, unsure in (sparse, swept)
+    )
     difference = (one.q - other.q).abs().detach()
     deviation = ((one.sigma * one.q).square() + (other.sigma * other.q).square()).sqrt().detach()
     agree = one.keep & other.keep & (difference <= limits[0] * deviation)
@@ -215,10 +218,6 @@ def _join(
     expected = torch.minimum(e_one, e_other)
     expected = torch.where(agree, factors[0] * expected, torch.where(conflict, factors[1] * expected, expected))
     return _Joint(one.keep | other.keep, weight, expected, one, other)
-
-
-def _select(mask: Tensor, a: _Answers, b: _Answers) -> _Answers:
-    return _Answers(*(torch.where(mask, x, y.to(x)) for x, y in zip(a, b, strict=True)))
 
 
 def _joint_estimate(selected: SelectedViews, joint: _Joint, half_error: float) -> Estimate:

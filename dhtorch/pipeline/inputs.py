@@ -113,7 +113,10 @@ def _common_precision(frames: list[Frame]) -> list[Frame]:
         frames = [f.replace(camera=f.camera.to(dtype)) for f in frames]
     if len(image_dtypes) > 1:
         dtype = _widest_dtype(image_dtypes)
-        frames = [f.replace(image=_to_floating(f.image, dtype)) for f in frames]
+        frames = [
+            f.replace(image=f.image.to(dtype) / 255 if f.image.dtype == torch.uint8 else f.image.to(dtype))
+            for f in frames
+        ]
     return frames
 
 
@@ -123,8 +126,3 @@ def _widest_dtype(dtypes: set[torch.dtype]) -> torch.dtype:
     for dtype in dtypes - {torch.uint8}:
         widest = torch.promote_types(widest, dtype)
     return widest
-
-
-def _to_floating(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """The image in a floating dtype; uint8 is scaled to [0, 1]."""
-    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)

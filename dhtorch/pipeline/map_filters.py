@@ -125,7 +125,12 @@ def filter_map(
     Cost: reads windows of some hundred pixels around the pixels beside depth steps and in pinholes, and makes
     ``speck_px`` passes over the map.
     """
-    reach = _reach(returns, options)[:, None, None]
+    # Depth (B,) m to which the sensor returns, by every ``reach_stride_px``-th pixel; 0 without returns
+    usable, depth = (v.flatten(1)[:, :: options.reach_stride_px] for v in (returns.usable, returns.depth.detach()))
+    depth = torch.where(usable, depth, torch.inf).sort(-1).values
+    n = usable.sum(-1)
+    rank = (options.reach_quantile * (n - 1).clamp_min(0)).long()
+    reach = torch.where(n > 0, depth.gather(-1, rank[:, None])[:, 0], 0.0)[:, None, None]
     within = returns.usable & (returns.depth.detach() < options.halo_reach * reach)
     within = within if sparse is None else within & ~sparse[:, None, None]
     sensed = returns.depth, returns.sigma, returns.usable, within
@@ -165,19 +170,19 @@ def _filter(*maps: Any, options: DenseOptions) -> tuple[Tensor, ...]:
     known = known.without(_fattened(known, grey, options))
     known = known.without(_torn(known, grey, options))
     known = known.without(_unsupported(known, options))
-    swept = _silence(swept, before.swept & ~known.swept)
+    # The map with answers ``which`` (B, h, w) bool UNCERTAIN
+    which = before.swept & ~known.swept
+    nan = torch.full_like(swept.depth, torch.nan)
+    swept = swept.replace(
+        depth=torch.where(which, nan, swept.depth),
+        sigma=torch.where(which, nan, swept.sigma),
+        score=swept.score.masked_fill(which, 0.0),
+        source=swept.source.masked_fill(which, Source.NONE),
+        gate=swept.gate.masked_fill(which, Gate.UNCERTAIN),
+    )
     where, q, sigma = _fill(known, within, options)
     depth = 1 / q
     return fill_fields(swept, where, depth, sigma * depth.square(), sigma * depth)
-
-
-def _reach(returns: SensorReturns, options: DenseOptions) -> Tensor:
-    """Depth (B,) m to which the sensor returns, by every ``reach_stride_px``-th pixel; 0 without returns."""
-    usable, depth = (v.flatten(1)[:, :: options.reach_stride_px] for v in (returns.usable, returns.depth.detach()))
-    depth = torch.where(usable, depth, torch.inf).sort(-1).values
-    n = usable.sum(-1)
-    rank = (options.reach_quantile * (n - 1).clamp_min(0)).long()
-    return torch.where(n > 0, depth.gather(-1, rank[:, None])[:, 0], 0.0)
 
 
 @torch.no_grad()
@@ -187,18 +192,6 @@ def _known(swept: DepthMap, returns: SensorReturns) -> _Known:
     sigma = torch.where(usable, returns.sigma.to(swept.sigma), torch.where(keep, swept.sigma, 0.0))
     q = 1 / depth
     return _Known(q, sigma * q.square(), usable, keep)
-
-
-def _silence(swept: DepthMap, which: Tensor) -> DepthMap:
-    """The map with answers ``which`` (B, h, w) bool UNCERTAIN."""
-    nan = torch.full_like(swept.depth, torch.nan)
-    return swept.replace(
-        depth=torch.where(which, nan, swept.depth),
-        sigma=torch.where(which, nan, swept.sigma),
-        score=swept.score.masked_fill(which, 0.0),
-        source=swept.source.masked_fill(which, Source.NONE),
-        gate=swept.gate.masked_fill(which, Gate.UNCERTAIN),
-    )
 
 
 def _halo(known: _Known, within: Tensor, options: DenseOptions) -> Tensor:
@@ -297,18 +290,14 @@ def _torn(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     return out & swept
 
 
-def _same_surface(known: _Known, options: DenseOptions) -> tuple[Tensor, Tensor]:
-    """Whether a pixel and its right, its lower neighbour are answered on one surface: (B, h, w-1), (B, h-1, w) bool."""
+def _unsupported(known: _Known, options: DenseOptions) -> Tensor:
+    """Swept pixels (B, h, w) bool in lines one pixel wide, and in specks that remain without those."""
+    # Whether a pixel and its right, its lower neighbour are answered on one surface: (B, h, w-1), (B, h-1, w)
     q, answered = known.q, known.answered
     limit = torch.maximum(options.same_surface_ratio * q, options.same_surface_sigmas * known.sigma)
     right = (q[..., 1:] - q[..., :-1]).abs() <= torch.minimum(limit[..., 1:], limit[..., :-1])
     down = (q[:, 1:] - q[:, :-1]).abs() <= torch.minimum(limit[:, 1:], limit[:, :-1])
-    return right & answered[..., 1:] & answered[..., :-1], down & answered[:, 1:] & answered[:, :-1]
-
-
-def _unsupported(known: _Known, options: DenseOptions) -> Tensor:
-    """Swept pixels (B, h, w) bool in lines one pixel wide, and in specks that remain without those."""
-    right, down = _same_surface(known, options)
+    right, down = right & answered[..., 1:] & answered[..., :-1], down & answered[:, 1:] & answered[:, :-1]
     line = known.swept & ~_in_block(right[:, 1:] & right[:, :-1] & down[..., 1:] & down[..., :-1])
     speck = small_components(known.answered & ~line, options.speck_px, same=(right, down))
     return line | (speck & known.swept)

@@ -188,7 +188,10 @@ def _filled(*tensors: Any, options: DenseOptions) -> Sequence[Tensor]:
         slots = _support_slots(cells, options)
     middle = _cell_middles(cells, options)
     supports = _take(cells, slots, middle)
-    planes = _fit_planes(supports, _wanted(unanswered, options), options)
+    to_fill = _cell_sums(unanswered.float(), options) > 0
+    planes = _fit_planes(
+        supports, window_extreme(to_fill, options.plane_neighbours, torch.logical_or).flatten(1), options
+    )
     accepted, disagreement = _tested(planes, supports, cells.answered.shape, options)
     accepted &= ~_is_refuted(planes, supports, reach, options).view(accepted.shape)
     q, relative = _at_pixels(planes, disagreement, swept.depth.shape, cells.answered.shape, options)
@@ -311,12 +314,6 @@ def _triples(per_ray: int) -> list[tuple[int, int, int]]:
         for turn in (4, 9):
             out.append((first * per_ray, (first + 1) * per_ray - 1, (first + turn) % _DIRECTIONS * per_ray))
     return out
-
-
-def _wanted(unanswered: Tensor, options: DenseOptions) -> Tensor:
-    """Cells (B, N) bool with pixels to fill, and those around whose planes are compared."""
-    to_fill = _cell_sums(unanswered.float(), options) > 0
-    return window_extreme(to_fill, options.plane_neighbours, torch.logical_or).flatten(1)
 
 
 @torch.no_grad()

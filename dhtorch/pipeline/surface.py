@@ -72,7 +72,16 @@ def sweep_planes(
     spacing = q[:, 1] - q[:, 0]
     best_q = (best.plane + best.shift) * spacing[:, None, None]
     n_views = n_views[:, None, None]
-    reach = _second_best_reach(base, source_views, best_q, spacing, options)
+    # Number of planes (B,) that move a pixel by ``second_best_radius_px`` in the view with the largest motion
+    lengths = []
+    sampled = best_q.flatten(1)[:, :: options.motion_stride_px]  # its median is close to that of all pixels
+    for view, _, _, use in source_views:
+        warp = plane_sweep.epipolar_warp(base, view)
+        warp = warp._replace(a=warp.a[..., :: options.motion_stride_px])
+        (u_0, v_0), (u_1, v_1) = (warp.at(sampled + k * spacing[:, None]) for k in (0, 1))
+        length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
+        lengths.append(torch.where(use, length, 0.0))
+    reach = (options.second_best_radius_px / torch.stack(lengths).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
     margin = plane_sweep.second_best_margin(aggregated, best, reach)
     alone = margin >= options.min_second_best_margin * n_views
     misfit = (best.cost - _unused_cost(source_views, best.cost)[:, None, None]) / n_views.to(q)
@@ -98,25 +107,6 @@ def _costs(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: T
     if fresh:
         C.zero_()
     return plane_sweep.planes_last(C)
-
-
-def _second_best_reach(
-    base: plane_sweep.ReferenceView,
-    source_views: list[SourceView],
-    q: Tensor,
-    spacing: Tensor,
-    options: DenseOptions,
-) -> Tensor:
-    """Number of planes (B,) that move a pixel by ``second_best_radius_px`` in the view with the largest motion."""
-    lengths = []
-    sampled = q.flatten(1)[:, :: options.motion_stride_px]  # its median is close to that of all pixels
-    for view, _, _, use in source_views:
-        warp = plane_sweep.epipolar_warp(base, view)
-        warp = warp._replace(a=warp.a[..., :: options.motion_stride_px])
-        (u_0, v_0), (u_1, v_1) = (warp.at(sampled + k * spacing[:, None]) for k in (0, 1))
-        length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
-        lengths.append(torch.where(use, length, 0.0))
-    return (options.second_best_radius_px / torch.stack(lengths).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
 
 
 def refine_surface(
@@ -194,7 +184,10 @@ def _joint_step(
             occluded = plane_sweep.occlusion_mask(warp, at, options.occlusion_planes * spacing)
             visible = window.seen & use[:, None, None] & ~occluded
             pose_var = pose_variance(base, view, fit, at, window.motion) if last else None
-        sums = _add_view(sums, window, visible, options.max_step_planes * spacing, pose_var, options)
+        max_step = options.max_step_planes * spacing
+        columns = window.step, window.contrast, window.noise, window.correlation
+        before = (None,) * len(_ViewSums._fields) if sums is None else sums
+        sums = _add_to_sums(*columns, visible, max_step, pose_var, *before, options=options)
     assert sums is not None
     return sums.step / sums.weight.clamp_min(MIN_WEIGHT), sums
 
@@ -207,23 +200,6 @@ class _ViewSums(NamedTuple):
     best: Tensor  # largest correlation, -1 where no view sees the pixel
     seen: Tensor  # bool
     shared: Tensor | None  # None without variances by motions
-
-
-def _add_view(
-    sums: _ViewSums | None,
-    window: plane_sweep.WindowFit,
-    visible: Tensor,
-    max_step: Tensor,
-    pose_var: Tensor | None,
-    options: DenseOptions,
-) -> _ViewSums:
-    """The sums, None before the first view, with one view more, for the pixels ``visible`` (B, h, w) in it.
-
-    Its step is at most ``max_step`` (B,) 1/m; ``pose_var`` (B, h, w) 1/m² is the variance by its motion.
-    """
-    columns = window.step, window.contrast, window.noise, window.correlation
-    before = (None,) * len(_ViewSums._fields) if sums is None else sums
-    return _add_to_sums(*columns, visible, max_step, pose_var, *before, options=options)
 
 
 def _add_to_sums_kernel(*tensors: Tensor | None, options: DenseOptions) -> _ViewSums:

@@ -294,7 +294,13 @@ def _search(
         score, k = joint.max(-1)
         if level == 0:
             place = torch.arange(K, device=k.device)
-            peak = _peaks(joint)  # between hypotheses: a repeated texture fits equally well at its periods
+            # Between hypotheses a repeated texture fits equally well at its periods: local maxima are raised to the
+            # vertex of the parabola through their neighbours.
+            left, middle, right = joint[:, :-2], joint[:, 1:-1], joint[:, 2:]
+            bend = (2 * middle - left - right).clamp_min(MIN_BEND)
+            vertex = middle + (right - left).square() / (8 * bend)
+            is_peak = (middle >= left) & (middle >= right)
+            peak = torch.cat((joint[:, :1], torch.where(is_peak, vertex, middle).clamp(max=1), joint[:, -1:]), 1)
             elsewhere = torch.where((place - k[:, None]).abs() >= limits.exclusion, peak, -1.0).amax(-1)
             best = peak.gather(1, k[:, None])[:, 0]
             unique = (1 - best + COST_FLOOR) < limits.max_cost_ratio * (1 - elsewhere + COST_FLOOR)
@@ -341,15 +347,6 @@ def _vertex(score: Tensor, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     left, middle, right = (score.gather(1, inner + d)[:, 0] for d in (-1, 0, 1))
     bend = (2 * middle - left - right).clamp_min(MIN_BEND)
     return torch.where(k == inner[:, 0], (0.5 * (right - left) / bend).clamp(-0.5, 0.5), 0.0), bend, inner
-
-
-def _peaks(score: Tensor) -> Tensor:
-    """Scores (M, K) with local maxima raised to the vertex of the parabola through their neighbours."""
-    left, middle, right = score[:, :-2], score[:, 1:-1], score[:, 2:]
-    bend = (2 * middle - left - right).clamp_min(MIN_BEND)
-    vertex = middle + (right - left).square() / (8 * bend)
-    is_peak = (middle >= left) & (middle >= right)
-    return torch.cat((score[:, :1], torch.where(is_peak, vertex, middle).clamp(max=1), score[:, -1:]), 1)
 
 
 def _pixels(s: _Segment, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:

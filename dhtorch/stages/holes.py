@@ -133,16 +133,11 @@ def _texture(grey: Tensor) -> tuple[Tensor]:
 
     Sobel gradients of all but the outermost pixels.
     """
-    gx, gy = _sobel(grey)
-    smaller, _ = eigenvalues_2x2((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
-    return (smaller / (16 * len(gx) * len(gx)),)
-
-
-def _sobel(grey: Tensor) -> tuple[Tensor, Tensor]:
-    """Four times the gradient (size - 2, size - 2, P) of windows (size, size, P)."""
     across, down = grey[:, 2:] - grey[:, :-2], grey[2:] - grey[:-2]
     gx = torch.add(across[:-2] + across[2:], across[1:-1], alpha=2)
-    return gx, torch.add(down[:, :-2] + down[:, 2:], down[:, 1:-1], alpha=2)
+    gy = torch.add(down[:, :-2] + down[:, 2:], down[:, 1:-1], alpha=2)
+    smaller, _ = eigenvalues_2x2((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
+    return (smaller / (16 * len(gx) * len(gx)),)
 
 
 def suggest_route(hole: Tensor) -> Tensor:

@@ -161,7 +161,10 @@ def _is_misaligned(
     """Whether (B,) there is a pose and the limits of :func:`reject_misaligned` reject it."""
     straight = _near_parallax(samples, tracks, fit, camera_0, camera_1)
     n = straight.used.sum(-1)
-    is_exact = _pose_angle(fit, masked_median(straight.p, straight.used)) <= MAX_POSE_ANGLE
+    p = masked_median(straight.p, straight.used)
+    variance = fit.cov.diagonal(dim1=-2, dim2=-1).nan_to_num(0.0)
+    rotation, translation = variance.split(3, -1)
+    is_exact = (rotation.mean(-1) + translation.mean(-1) * p[:, 0].nan_to_num(0.0).square()).sqrt() <= MAX_POSE_ANGLE
     tested = fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
     if not any_possible(tested):
         return tested
@@ -174,16 +177,6 @@ def _is_misaligned(
     gain, n_shared = _attachment_gain(_thinned(straight), samples)
     rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
     return rejected & tested
-
-
-def _pose_angle(fit: PoseFit, p: Tensor) -> Tensor:
-    """Standard deviation (B,) rad of the direction of a point at inverse depth p (B, 1) by the pose's covariance.
-
-    The mean of all directions; 0 for a pose without a covariance.
-    """
-    variance = fit.cov.diagonal(dim1=-2, dim2=-1).nan_to_num(0.0)
-    rotation, translation = variance.split(3, -1)
-    return (rotation.mean(-1) + translation.mean(-1) * p[:, 0].nan_to_num(0.0).square()).sqrt()
 
 
 def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Camera, camera_1: Camera) -> _Parallax:

@@ -164,7 +164,13 @@ class _Options:
 
 
 def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Camera, draws: Tensor) -> PoseFit:
-    points, usable = _planes(xyz, uv, valid)
+    # x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of PRODUCT_LANES; unusable points at zero
+    points = torch.cat((xyz.transpose(1, 2), uv.transpose(1, 2)), 1)
+    usable = valid & all_finite(points, 1)
+    points = torch.where(usable[:, None], points, torch.zeros_like(points))
+    N = usable.shape[1]
+    padding = (0, round_up(N, PRODUCT_LANES) - N)
+    points, usable = torch.nn.functional.pad(points, padding), torch.nn.functional.pad(usable, padding)
     fit = _near_pose(points, usable, camera.f, camera.c, draws, options=options)
     return fit.replace(inlier=fit.inlier[:, : xyz.shape[1]])
 
@@ -279,16 +285,6 @@ def _inlier_normal_equations(o: _Options, rows: Tensor, inlier: Tensor) -> tuple
     """Normal equations of the inliers, weighted by the robust kernel."""
     _, weight = robust_loss((rows[:, 6] * rows[:, 6]).sum(1), o.kernel, o.kernel_px)
     return normal_equations(rows, torch.where(inlier, weight, 0.0))
-
-
-def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of PRODUCT_LANES; unusable points at zero."""
-    points = torch.cat((xyz.transpose(1, 2), uv.transpose(1, 2)), 1)
-    usable = valid & all_finite(points, 1)
-    points = torch.where(usable[:, None], points, torch.zeros_like(points))
-    N = usable.shape[1]
-    padding = (0, round_up(N, PRODUCT_LANES) - N)
-    return torch.nn.functional.pad(points, padding), torch.nn.functional.pad(usable, padding)
 
 
 def _robust_pose_kernel(

@@ -125,7 +125,7 @@ def confidence_from_error(
         round_trip_scale_px: round trip that does; None = not used.
         half_error: expected error h at which the score is one half.
         recalibration: elementwise, score → probability that the error is below 10 %, such as the table of a
-            calibration (``dhtorch.calibration``); None = unchanged score. An increasing one keeps the order.
+            calibration (``dhtorch.metrics.calibration``); None = unchanged score. An increasing one keeps the order.
         min_score: answers below it (after recalibration) become unanswered with LOW_SCORE.
 
     Returns:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import pytree
-from dhtorch.calibration.score_calibration import Calibration
+from dhtorch.metrics.calibration import Calibration
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method

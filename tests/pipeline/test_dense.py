@@ -5,11 +5,11 @@ import torch
 from support.board_scenes import Board, look
 
 from dhtorch import MAP
-from dhtorch.calibration.monotone import MonotoneTable, Sigmoid
-from dhtorch.calibration.score_calibration import Calibration, SigmaModel
 from dhtorch.codes import Gate, Source, is_swept
 from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
+from dhtorch.metrics.calibration import Calibration, SigmaModel
 from dhtorch.metrics.holdout import range_split
+from dhtorch.metrics.monotone import MonotoneTable, Sigmoid
 from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.dense import (
     downscale_grey,

@@ -64,7 +64,7 @@ MAIN = ("data=synthetic",)
         (MAIN, "extract/dataset.py", False),
         (MAIN, "experiments/report/page.py", False),
         (MAIN, "cli/run.py", False),
-        (MAIN, "calibration/map.json", False),
+        (MAIN, "metrics/calibration/map.json", False),
         ((*MAIN, "experiment=icp"), "experiments/negative/icp.py", True),
         ((*MAIN, "experiment=icp"), "experiments/negative/registration.py", True),
         ((*MAIN, "experiment=icp"), "experiments/paper/heldout.py", False),
@@ -82,10 +82,10 @@ def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrid
 
 def test_tables_that_travel_with_a_module_count_with_it(package):
     config = copy.deepcopy(settings(*MAIN))
-    node = {"_target_": "dhtorch.calibration.load_probability", "name": "map"}
+    node = {"_target_": "dhtorch.metrics.calibration.load_probability", "name": "map"}
     config["method"]["score"]["recalibration"] = node
     before = result_files.compute_result_key(config, "d", code_dir=package)
-    with edited(package / "calibration" / "map.json"):
+    with edited(package / "metrics" / "calibration" / "map.json"):
         assert result_files.compute_result_key(config, "d", code_dir=package) != before
     assert not any(
         name.endswith((".pyc", ".css"))

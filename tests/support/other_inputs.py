@@ -24,7 +24,7 @@ import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from dhtorch import calibration, export
+from dhtorch import export
 from dhtorch.cli import errors, pin
 from dhtorch.cli import run as commands
 from dhtorch.data.codecs.exr import read_exr
@@ -40,6 +40,7 @@ from dhtorch.extract.origin import LeRobotSource
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.shards import find_finished_shards
 from dhtorch.measure.pin import CameraPin
+from dhtorch.metrics import calibration
 from dhtorch.runtime import results as result_files
 from dhtorch.stages.score import LearnedScore
 from dhtorch.viz.viewer.points import read_ply_exhibit

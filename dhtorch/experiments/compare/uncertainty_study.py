@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from dhtorch.calibration import list_calibrations, load_calibration
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import SceneLike, scenes_of
@@ -19,6 +18,7 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
+from dhtorch.metrics.calibration import list_calibrations, load_calibration
 from dhtorch.metrics.uncertainty import disjoint_agreement, interval_coverage, measure_uncertainty, range_bias
 from dhtorch.records import Estimate
 

@@ -2,6 +2,10 @@
 
 A calibration is stored as a small JSON text: two tables of the score (probability of a good answer, expected error), a
 sigmoid as a simple baseline, a correction of sigma, thresholds chosen by plug-in risk control, and its provenance.
+Those shipped with the package are loaded by name:
+
+    calibration = dhtorch.metrics.calibration.load_calibration("map")
+    score = functools.partial(rank_by_error, recalibration=calibration.probability)
 """
 
 from __future__ import annotations
@@ -11,39 +15,27 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from dhtorch.calibration.monotone import MonotoneTable, Sigmoid, fit_isotonic, fit_platt
 from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
+from dhtorch.metrics.monotone import MonotoneTable, Sigmoid, fit_isotonic, fit_platt
 from dhtorch.metrics.reliability import GOOD_ERROR_REL, pool_answers
 from dhtorch.metrics.risk import cap_error
 from dhtorch.records import DepthMap, SigmaBudget
 from dhtorch.runtime import storage
 
-_SCHEMA_VERSION = 1
-
 Answers = TypeVar("Answers", Points, DepthMap)
 
-#: Least fraction of the fitting scenes' weight in a step of a table.
-_MIN_STEP_SHARE = 0.02
+#: Calibrations shipped with the package, one JSON file each.
+_SHIPPED = Path(__file__).parent
 
-#: Probability that a normal variable lies within one standard deviation.
-_ONE_SIGMA_SHARE = 0.6826894921370859
-
-#: Fraction required within two standard deviations: less than the 95 % of a normal variable, because errors have
-#: heavier tails and a few gross ones would widen every sigma; slightly above 90 %, to hold 90 % in other rooms.
-_TWO_SIGMA_SHARE = 0.91
-
-#: Target mean errors, in per cent, for which thresholds are stored.
-_TARGET_ERRORS_PERCENT = (5, 10, 20)
-
-
-#: Floors of sigma tried, as fractions of the depth.
-_SIGMA_FLOORS_REL = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
+#: Values that every file of this layout has.
+_LAYOUT = {"schema": 1, "good_error": GOOD_ERROR_REL}
 
 
 @dataclass(frozen=True)
@@ -98,10 +90,9 @@ class Calibration:
     def to_json(self) -> str:
         """The calibration as strict JSON."""
         content = {
-            "schema": _SCHEMA_VERSION,
-            "good_error": GOOD_ERROR_REL,
-            "probability": _corners(self.probability),
-            "expected_error": _corners(self.expected_error),
+            **_LAYOUT,
+            "probability": {"score": self.probability.x.tolist(), "value": self.probability.y.tolist()},
+            "expected_error": {"score": self.expected_error.x.tolist(), "value": self.expected_error.y.tolist()},
             "sigmoid": {"slope": float(self.sigmoid.slope), "offset": float(self.sigmoid.offset)},
             "sigma": None if self.sigma is None else {"scale": self.sigma.scale, "floor": self.sigma.floor},
             "thresholds": {str(k): v for k, v in self.thresholds.items()},
@@ -113,8 +104,8 @@ class Calibration:
 def fit_calibration(
     scenes: Sequence[Points],
     *,
-    min_share: float = _MIN_STEP_SHARE,
-    targets: Sequence[int] = _TARGET_ERRORS_PERCENT,
+    min_share: float = 0.02,
+    targets: Sequence[int] = (5, 10, 20),
     choose: Callable[[Sequence[Points], float], control.ScoreThreshold] = control.plug_in_threshold,
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
@@ -169,16 +160,17 @@ def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
         return None
     error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
     best, lowest_cost = SigmaModel(1.0, 0.0), math.inf
-    for floor in _SIGMA_FLOORS_REL:
-        scale = (
-            _quantile((error.square() - floor * floor) / sigma.square(), weight, _ONE_SIGMA_SHARE).clamp_min(0).sqrt()
-        )
+    for floor in (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31))):
+        within_one = _quantile((error.square() - floor * floor) / sigma.square(), weight, 0.6826894921370859)
+        scale = within_one.clamp_min(0).sqrt()
         model = SigmaModel(float(scale), floor)
         spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
         cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
         best, lowest_cost = (model, cost) if cost < lowest_cost else (best, lowest_cost)
     spread = best(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
-    wider = max(1.0, float(_quantile(error / spread, weight, _TWO_SIGMA_SHARE)) / 2)
+    # Less than the 95 % of a normal variable within two sigmas, because errors have heavier tails and a few gross ones
+    # would widen every sigma; slightly above 90 %, to hold 90 % in other rooms.
+    wider = max(1.0, float(_quantile(error / spread, weight, 0.91)) / 2)
     return SigmaModel(best.scale * wider, best.floor * wider)
 
 
@@ -204,64 +196,87 @@ def parse_calibration(text: str, where: str = "calibration") -> Calibration:
         content = storage.parse_strict_json(text)
     except ValueError as error:
         raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
-    names = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
-    _fields(content, (*names, "provenance"), where)
-    for name, value in (("schema", _SCHEMA_VERSION), ("good_error", GOOD_ERROR_REL)):
+    tables = {"probability": True, "expected_error": False}  # name -> whether it rises
+    _fields(content, (*_LAYOUT, *tables, "sigmoid", "sigma", "thresholds", "provenance"), where)
+    for name, value in _LAYOUT.items():
         _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
-    _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
-    slope, offset = (_number(content["sigmoid"][k], f"{where}.sigmoid.{k}") for k in ("slope", "offset"))
+    numbers = {}
+    for name, keys in {"sigmoid": ("slope", "offset"), "sigma": ("scale", "floor")}.items():
+        if name == "sigmoid" or content[name] is not None:
+            _fields(content[name], keys, f"{where}.{name}")
+            numbers[name] = [_number(content[name][k], f"{where}.{name}.{k}") for k in keys]
+    for key, value in zip(("scale", "floor"), numbers.get("sigma", ()), strict=False):
+        _expect(value >= 0, f"{where}.sigma.{key}", content["sigma"][key], "a number of at least 0")
     _expect(isinstance(content["provenance"], dict), f"{where}.provenance", content["provenance"], "an object")
+    _expect(isinstance(content["thresholds"], dict), f"{where}.thresholds", content["thresholds"], "an object")
+    thresholds = {}
+    for name, value in content["thresholds"].items():
+        field_name, is_percent = f"{where}.thresholds.{name}", name.isdecimal() and len(name) <= 2 and int(name) > 0
+        _expect(is_percent, field_name, name, "a whole number of per cent")
+        thresholds[int(name)] = None if value is None else _number(value, field_name)
     return Calibration(
-        probability=_read_table(content["probability"], f"{where}.probability", rising=True),
-        expected_error=_read_table(content["expected_error"], f"{where}.expected_error", rising=False),
-        sigmoid=Sigmoid(torch.tensor(slope, dtype=torch.float64), torch.tensor(offset, dtype=torch.float64)),
-        sigma=None if content["sigma"] is None else _read_sigma(content["sigma"], f"{where}.sigma"),
-        thresholds=_read_thresholds(content["thresholds"], f"{where}.thresholds"),
+        **{k: _read_table(content[k], f"{where}.{k}", rising=rises) for k, rises in tables.items()},
+        sigmoid=Sigmoid(*(torch.tensor(v, dtype=torch.float64) for v in numbers["sigmoid"])),
+        sigma=SigmaModel(*numbers["sigma"]) if "sigma" in numbers else None,
+        thresholds=thresholds,
         provenance=content["provenance"],
     )
 
 
-def _corners(table: MonotoneTable) -> dict[str, list[float]]:
-    return {"score": table.x.tolist(), "value": table.y.tolist()}
+def list_calibrations() -> list[str]:
+    """Names of the calibrations shipped with the package."""
+    return sorted(file.stem for file in _SHIPPED.glob("*.json"))
+
+
+def load_calibration(name: str | Path) -> Calibration:
+    """Load a calibration by its name or from a file.
+
+    Args:
+        name: one of :func:`list_calibrations`, or the path of a ``.json`` file.
+
+    Raises:
+        FileNotFoundError: no such calibration.
+        ValueError: not a valid calibration; the message names file and field.
+    """
+    path = Path(name) if Path(name).suffix == ".json" else _SHIPPED / f"{name}.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{name}: found no calibration, expected a .json file or one of {list_calibrations()}")
+    return parse_calibration(storage.read_utf8(path), path.name)
+
+
+def load_probability(name: str | Path) -> Callable[[Tensor], Tensor]:
+    """The table from score to the probability of a good answer alone, for ``rank_by_error(recalibration=)``."""
+    return load_calibration(name).probability
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> Path:
+    """Write a calibration as JSON.
+
+    Raises:
+        ValueError: its provenance lacks the method or the scenes that it was fitted on.
+    """
+    for name in ("method", "scenes"):
+        if not calibration.provenance.get(name):
+            raise ValueError(f"{path}: found no provenance.{name}, expected what the calibration was fitted on")
+    text = calibration.to_json()
+    parse_calibration(text, str(path))
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def _read_table(content: Any, where: str, *, rising: bool) -> MonotoneTable:
     _fields(content, ("score", "value"), where)
-    columns: dict[str, Tensor] = {}
     for name in ("score", "value"):
         _expect(isinstance(content[name], list) and content[name] != [], f"{where}.{name}", content[name], "a list")
-        numbers = [_number(v, f"{where}.{name}.{k}") for k, v in enumerate(content[name])]
-        columns[name] = torch.tensor(numbers, dtype=torch.float64)
-    x, y = content["score"], content["value"]
+    x, y = ([_number(v, f"{where}.{name}.{k}") for k, v in enumerate(content[name])] for name in ("score", "value"))
     _expect(len(x) == len(y), f"{where}.value", f"{len(y)} numbers", f"{len(x)}, one for each score")
-    _expect(all(a < b for a, b in pairwise(x)), f"{where}.score", x, "rising numbers")
+    _expect(all(a < b for a, b in pairwise(x)), f"{where}.score", content["score"], "rising numbers")
     ordered = all((a <= b) if rising else (a >= b) for a, b in pairwise(y))
-    _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", y, f"{_direction(rising)} numbers from 0 to 1")
-    return MonotoneTable(columns["score"], columns["value"])
-
-
-def _read_sigma(content: Any, where: str) -> SigmaModel:
-    _fields(content, ("scale", "floor"), where)
-    for name in ("scale", "floor"):
-        _expect(
-            _number(content[name], f"{where}.{name}") >= 0, f"{where}.{name}", content[name], "a number of at least 0"
-        )
-    return SigmaModel(float(content["scale"]), float(content["floor"]))
-
-
-def _read_thresholds(content: Any, where: str) -> dict[int, float | None]:
-    _expect(isinstance(content, dict), where, content, "an object")
-    thresholds: dict[int, float | None] = {}
-    for name, value in content.items():
-        _expect(
-            name.isdecimal() and len(name) <= 2 and int(name) > 0, f"{where}.{name}", name, "a whole number of per cent"
-        )
-        thresholds[int(name)] = None if value is None else _number(value, f"{where}.{name}")
-    return thresholds
-
-
-def _direction(rising: bool) -> str:
-    return "rising" if rising else "falling"
+    expected = f"{'rising' if rising else 'falling'} numbers from 0 to 1"
+    _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", content["value"], expected)
+    return MonotoneTable(*(torch.tensor(v, dtype=torch.float64) for v in (x, y)))
 
 
 def _fields(content: Any, names: Sequence[str], where: str) -> None:
@@ -274,8 +289,7 @@ def _fields(content: Any, names: Sequence[str], where: str) -> None:
 
 def _number(value: Any, where: str) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    is_finite = is_number and abs(value) <= sys.float_info.max
-    _expect(is_finite, where, value, "a finite number")
+    _expect(is_number and abs(value) <= sys.float_info.max, where, value, "a finite number")
     return float(value)
 
 

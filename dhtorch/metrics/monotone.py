@@ -13,16 +13,6 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.pytree import Record, record
 
-#: Largest rise of the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.
-_MAX_END_RISE = 1e-3
-
-#: Weight of the ridge term towards the identity, beside a log loss of total weight 1: keeps the sigmoid of separable
-#: data finite and is otherwise negligible.
-_RIDGE_WEIGHT = 1e-6
-
-#: Least distance of a probability from 0 and 1 before its logit is taken.
-_LOGIT_MARGIN = 1e-6
-
 
 @record
 class MonotoneTable(Record):
@@ -94,28 +84,34 @@ def fit_isotonic(
     mass = torch.zeros_like(argument).index_add(0, group, weight)
     mean = torch.zeros_like(argument).index_add(0, group, weight * y) / mass
     sign = 1.0 if rising else -1.0
-    blocks = _join_light_blocks(
-        _pool_blocks((sign * mean).tolist(), mass.tolist(), argument.tolist()), min_share * float(mass.sum())
-    )
-    middle = [block[2] for block in blocks]
-    value = [sign * block[0] for block in blocks]
+    # Pool-adjacent-violators in one pass: a stack of blocks whose values rise strictly.
+    stack: list[_Block] = []
+    for point in zip((sign * mean).tolist(), mass.tolist(), argument.tolist(), strict=True):
+        block = point
+        while stack and stack[-1][0] >= block[0]:
+            block = _merge_blocks(stack.pop(), block)
+        stack.append(block)
+    # Light blocks merge with their neighbours; values still rise, as means of rising values.
+    least = min_share * float(mass.sum())
+    blocks: list[_Block] = []
+    for block in stack:
+        light = bool(blocks) and blocks[-1][1] < least
+        blocks.append(_merge_blocks(blocks.pop(), block) if light else block)
+    while len(blocks) > 1 and blocks[-1][1] < least:
+        last = blocks.pop()
+        blocks.append(_merge_blocks(blocks.pop(), last))
+    x_block, y_block = [block[2] for block in blocks], [sign * block[0] for block in blocks]
     low, high = (float(argument[0]), float(argument[-1])) if ends is None else ends
-    return _make_table(middle, value, min(low, middle[0]), max(high, middle[-1]))
-
-
-def _pool_adjacent_violators(
-    y: Tensor,  # (n,) in the order of the argument
-    weight: Tensor,  # (n,) > 0
-) -> Tensor:
-    """The rising sequence (n,) nearest to ``y`` in weighted square error, float64.
-
-    Raises:
-        ValueError: unequal lengths.
-    """
-    check("pool_adjacent_violators", y=(y, "n"), weight=(weight, "n"))
-    blocks = _pool_blocks(y.tolist(), weight.tolist(), [0.0] * y.numel())
-    value = torch.tensor([block[0] for block in blocks], dtype=torch.float64)
-    return value.repeat_interleave(torch.tensor([block[3] for block in blocks], dtype=torch.long))
+    corners = list(zip(x_block, y_block, strict=True))
+    if len(corners) > 1:
+        # The end blocks, where isotonic regression is flat, slope by a quarter of the step to the next block, at most
+        # 1e-3: no order is lost there.
+        left, right = low < x_block[0], high > x_block[-1]
+        first, final = (max(-1e-3, min(1e-3, (y_block[k + 1] - y_block[k]) / 4)) for k in (0, -2))
+        corners[0] = (x_block[0], y_block[0] + left * first)
+        corners[-1] = (x_block[-1], y_block[-1] - right * final)
+        corners = [(low, y_block[0])] * left + corners + [(high, y_block[-1])] * right
+    return MonotoneTable(*(torch.tensor(v, dtype=torch.float64) for v in zip(*corners, strict=True)))
 
 
 def fit_platt(
@@ -149,16 +145,19 @@ def fit_platt(
     sign = 2 * good.double() - 1
     identity = torch.tensor([1.0, 0.0], dtype=torch.float64, device=p.device)
 
+    # A ridge towards the identity, beside a log loss of total weight 1, keeps the sigmoid of separable data finite.
+    ridge = 1e-6
+
     def loss(theta: Tensor) -> Tensor:
-        pull = _RIDGE_WEIGHT / 2 * (theta - identity).square().sum()
+        pull = ridge / 2 * (theta - identity).square().sum()
         return (share * torch.nn.functional.softplus(-sign * (feature @ theta))).sum() + pull
 
     theta = identity
     for _ in range(steps):
         claimed = torch.sigmoid(feature @ theta)
-        gradient = feature.mT @ (share * (claimed - good.double())) + _RIDGE_WEIGHT * (theta - identity)
+        gradient = feature.mT @ (share * (claimed - good.double())) + ridge * (theta - identity)
         curvature = (feature * (share * claimed * (1 - claimed))[:, None]).mT @ feature
-        step = torch.linalg.solve(curvature + _RIDGE_WEIGHT * torch.eye(2).to(curvature), gradient)
+        step = torch.linalg.solve(curvature + ridge * torch.eye(2).to(curvature), gradient)
         before, length = loss(theta), 1.0
         while length > 1e-6 and loss(theta - length * step) > before:
             length /= 2
@@ -168,55 +167,15 @@ def fit_platt(
     return Sigmoid(theta[0], theta[1])
 
 
-#: A block: value, weight, weighted mean of its arguments, number of entries.
-_Block = tuple[float, float, float, int]
+#: A block: value, weight, weighted mean of its arguments.
+_Block = tuple[float, float, float]
 
 
 def _merge_blocks(a: _Block, b: _Block) -> _Block:
     mass = a[1] + b[1]
-    return (a[0] * a[1] + b[0] * b[1]) / mass, mass, (a[2] * a[1] + b[2] * b[1]) / mass, a[3] + b[3]
-
-
-def _pool_blocks(y: list[float], weight: list[float], arguments: list[float]) -> list[_Block]:
-    """Pool-adjacent-violators in one pass: a stack of blocks whose values rise strictly."""
-    stack: list[_Block] = []
-    for value, mass, argument in zip(y, weight, arguments, strict=True):
-        block = (value, mass, argument, 1)
-        while stack and stack[-1][0] >= block[0]:
-            block = _merge_blocks(stack.pop(), block)
-        stack.append(block)
-    return stack
-
-
-def _join_light_blocks(blocks: list[_Block], least: float) -> list[_Block]:
-    """Blocks merged with their neighbours until each weighs ``least``; values still rise, as means of rising values."""
-    joined: list[_Block] = []
-    for block in blocks:
-        light = bool(joined) and joined[-1][1] < least
-        joined.append(_merge_blocks(joined.pop(), block) if light else block)
-    while len(joined) > 1 and joined[-1][1] < least:
-        last = joined.pop()
-        joined.append(_merge_blocks(joined.pop(), last))
-    return joined
-
-
-def _make_table(x: list[float], y: list[float], low: float, high: float) -> MonotoneTable:
-    """Table with corners at the middles of blocks and at both ends, the end blocks sloped inwards."""
-    corners = list(zip(x, y, strict=True))
-    if len(x) > 1:
-        left, right = low < x[0], high > x[-1]
-        corners[0] = (x[0], y[0] + left * _end_rise(y[1] - y[0]))
-        corners[-1] = (x[-1], y[-1] - right * _end_rise(y[-1] - y[-2]))
-        corners = [(low, y[0])] * left + corners + [(high, y[-1])] * right
-    argument, value = zip(*corners, strict=True)
-    return MonotoneTable(torch.tensor(argument, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
-
-
-def _end_rise(step: float) -> float:
-    """Rise of an end block: a quarter of the ``step`` to the next block, at most ``_MAX_END_RISE`` in size."""
-    return max(-_MAX_END_RISE, min(_MAX_END_RISE, step / 4))
+    return (a[0] * a[1] + b[0] * b[1]) / mass, mass, (a[2] * a[1] + b[2] * b[1]) / mass
 
 
 def _logit(p: Tensor) -> Tensor:
-    p = p.clamp(_LOGIT_MARGIN, 1 - _LOGIT_MARGIN)
+    p = p.clamp(1e-6, 1 - 1e-6)
     return pad_elementwise(torch.log, p) - pad_elementwise(torch.log, 1 - p)
