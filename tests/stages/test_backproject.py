@@ -10,6 +10,7 @@ from dhtorch.codes import Flag
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera, Frame
 from dhtorch.stages.backproject import backproject
+from dhtorch.stages.holes import classify
 
 HW, DEPTH_HW = (40, 56), (20, 28)
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -139,10 +140,13 @@ def plain(
         {"edge_rel": 0.7},
         {"dark": 0.1, "saturated": 0.95},
         {"highlight": 0.6},
+        {"rows": slice(5, 9)},  # a depth map smaller than the neighbourhood
     ],
 )
-def test_every_sample_is_what_a_loop_says(options):
+def test_every_sample_equals_a_plain_loop(options):
     frame, uv = frames(), everywhere()
+    if "rows" in options:
+        frame, options = frame.replace(depth=frame.depth[:, 5:9], conf=frame.conf[:, 5:9]), {}
     found = backproject(frame, uv, **options)
     depth, sigma, xyz, confidence, flag = plain(frame, uv, **options)
     assert torch.equal(found.flag, flag.int())
@@ -155,7 +159,7 @@ def test_every_sample_is_what_a_loop_says(options):
 
 
 @pytest.mark.parametrize(("interleaved", "pixels"), [(False, 1 << 17), (True, 1 << 17), (False, 700)])
-def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved, pixels, monkeypatch):
+def test_all_pixels_at_once_have_the_bits_of_a_few(interleaved, pixels, monkeypatch):
     """So many are read from windows of the whole picture and map, some rows after the other; a few from patches."""
     monkeypatch.setattr("dhtorch.geometry.windows.MAX_BAND_PIXELS", pixels)
     frame = frames(dtype=torch.float32)
@@ -171,15 +175,6 @@ def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved, pix
     assert all((found.flag & bit).any() for bit in (1, 2, 4, 8, 16, 32, 128))
 
 
-def test_a_depth_map_smaller_than_the_neighbourhood_is_looked_at_whole():
-    frame, uv = frames(depth_hw=(12, 28)), everywhere()
-    small = frame.replace(depth=frame.depth[:, 5:9], conf=frame.conf[:, 5:9])
-    found = backproject(small, uv)
-    depth, _, _, confidence, flag = plain(small, uv)
-    assert torch.equal(found.depth, depth) and torch.equal(found.flag, flag.int())
-    assert torch.equal(found.confidence, confidence)
-
-
 def still(image=0.5, depth=1.5, hw=(16, 16), **changes):
     """A grey view of one value and one depth, exact in binary."""
     return Frame(
@@ -190,80 +185,74 @@ def still(image=0.5, depth=1.5, hw=(16, 16), **changes):
     )
 
 
-MIDDLE = torch.tensor([[8.0, 8.0]])
+GLINT = still(0.25)
+GLINT.image[..., 8, 8] = 0.75
+STEP = still()
+STEP.depth[:, :, 9:] = 2.25
+CONF = torch.full((1, 16, 16), 2, dtype=torch.uint8)
+CONF[0, 8, 8] = 1
+WHITE = still(1.0).image
 
 
-def flag_of(frame, uv=MIDDLE, **options):
-    return int(backproject(frame, uv, **options).flag[0, 0])
+def glint(rgb, around):
+    """A pixel of three bytes on a grey surface."""
+    image = torch.full((1, 3, 16, 16), around, dtype=torch.uint8)
+    image[0, :, 8, 8] = torch.tensor(rgb, dtype=torch.uint8)
+    return still().replace(image=image)
 
 
-def test_limits_hold_at_the_limit_itself():
-    assert flag_of(still(), near_limit=1.5) == 0 and flag_of(still(), near_limit=1.49) == Flag.BEYOND_NEAR
-    assert flag_of(still(), dark=0.5) == Flag.UNDEREXPOSED and flag_of(still(), dark=0.499) == 0
-    assert flag_of(still(), saturated=0.5) == Flag.SATURATED and flag_of(still(), saturated=0.501) == 0
-    step = still()
-    step.depth[:, :, 9:] = 2.25
-    assert flag_of(step, edge_rel=0.5) == 0 and flag_of(step, edge_rel=0.499) == Flag.DEPTH_EDGE
-    glint = still(0.25)
-    glint.image[..., 8, 8] = 0.75
-    assert flag_of(glint, highlight=0.75) == Flag.SPECULAR and flag_of(glint, highlight=0.751) == 0
-    conf = torch.ones(1, 16, 16, dtype=torch.uint8)
-    assert flag_of(still(conf=conf), min_conf=1) == 0 and flag_of(still(conf=conf), min_conf=2) == Flag.LOW_CONF
-    assert flag_of(still(conf=0 * conf), min_conf=0) == 0
+@pytest.mark.parametrize(
+    ("frame", "options", "flag", "confidence"),
+    [
+        (still(), {}, 0, 1),
+        # limits hold at the limit itself
+        (still(), {"near_limit": 1.5}, 0, 1),
+        (still(), {"near_limit": 1.49}, Flag.BEYOND_NEAR, 0),
+        (still(), {"dark": 0.5}, Flag.UNDEREXPOSED, 1),
+        (still(), {"dark": 0.499}, 0, 1),
+        (still(), {"saturated": 0.5}, Flag.SATURATED, 0.5),
+        (still(), {"saturated": 0.501}, 0, 1),
+        (STEP, {"edge_rel": 0.5}, 0, 1),
+        (STEP, {"edge_rel": 0.499}, Flag.DEPTH_EDGE, 0.5),
+        (GLINT, {"highlight": 0.75}, Flag.SPECULAR, 0.5),
+        (GLINT, {"highlight": 0.751}, 0, 1),
+        (still(conf=CONF), {"min_conf": 1}, 0, 0.5),
+        (still(conf=CONF), {"min_conf": 2}, Flag.LOW_CONF, 0),
+        (still(conf=0 * CONF), {"min_conf": 0}, 0, 0),
+        (STEP.replace(conf=0 * CONF), {}, Flag.LOW_CONF | Flag.DEPTH_EDGE, 0),
+        # confidence is halved for every doubt
+        (STEP.replace(conf=CONF), {}, Flag.DEPTH_EDGE, 0.25),
+        (STEP.replace(image=WHITE, conf=CONF), {}, Flag.DEPTH_EDGE | Flag.SATURATED, 0.125),
+        (STEP.replace(image=WHITE), {}, Flag.DEPTH_EDGE | Flag.SATURATED, 0.25),
+        # grey 26 of 255 lies between 0.1 and 0.11 of white
+        (still().replace(image=torch.full((1, 1, 16, 16), 26, dtype=torch.uint8)), {"dark": 0.11}, Flag.UNDEREXPOSED, 1),
+        (still().replace(image=torch.full((1, 1, 16, 16), 26, dtype=torch.uint8)), {"dark": 0.1}, 0, 1),
+        # a highlight has no colour (a channel that lacks 14 % passes) and outshines its surroundings by a tenth
+        (glint((240, 240, 240), 200), {}, Flag.SPECULAR, 0.5),
+        (glint((240, 240, 240), 214), {}, 0, 1),
+        (glint((240, 240, 240), 213), {}, Flag.SPECULAR, 0.5),
+        (glint((240, 240, 207), 180), {}, Flag.SPECULAR, 0.5),
+        (glint((240, 240, 201), 180), {}, 0, 1),
+        (glint((201, 240, 240), 180), {}, 0, 1),
+    ],
+)  # fmt: skip
+def test_flags_and_confidence_at_the_limits(frame, options, flag, confidence):
+    found = backproject(frame, torch.tensor([[8.0, 8.0]]), **options)
+    assert (int(found.flag), float(found.confidence)) == (flag, confidence)
 
 
-@pytest.mark.parametrize("image", [torch.uint8, torch.float32])
-def test_limits_of_brightness_are_shares_of_white(image):
-    """Grey 26 of 255 lies between 0.1 and 0.11 of white, whatever the picture is stored in; likewise 230."""
-    white = 255 if image == torch.uint8 else 1.0
-    for level, dark, light in ((26, (0.11, 0.1), (0.1, 0.11)), (230, (0.91, 0.9), (0.9, 0.91))):
-        frame = still()
-        frame = frame.replace(image=torch.full_like(frame.image, level).div(255).mul(white).round(decimals=6).to(image))
-        assert [flag_of(frame, dark=x) for x in dark] == [Flag.UNDEREXPOSED, 0]
-        assert [flag_of(frame, saturated=x) for x in light] == [Flag.SATURATED, 0]
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_of_half_precision_is_computed_with_as_pixels_are(dtype):
+    frame = still(depth=1.1).replace(depth=torch.full((1, 16, 16), 1.1).half())
+    uv = torch.tensor([[8.0, 8.0]], dtype=dtype)
+    found = backproject(frame.replace(camera=frame.camera.to(dtype)), uv, sigma_rel=0.1)
+    value = torch.tensor(1.1).half().to(dtype)
+    assert found.depth.dtype == found.sigma.dtype == found.confidence.dtype == dtype
+    assert found.depth[0, 0] == value and found.sigma[0, 0] == 0.1 * value
 
 
-def test_a_highlight_is_without_colour_and_outshines_its_surroundings():
-    """White 240 of 255 on 200: by a sixth. A channel that lacks 14 % passes, one that lacks 16 % does not."""
-    frame = still().replace(image=torch.full((1, 3, 16, 16), 200, dtype=torch.uint8))
-    for rgb, around, shines in (
-        ((240, 240, 240), 200, True),
-        ((240, 240, 240), 214, False),  # 240 - mean is 25 of the 25.5 that are asked for
-        ((240, 240, 240), 213, True),
-        ((240, 240, 207), 180, True),
-        ((240, 240, 201), 180, False),
-        ((201, 240, 240), 180, False),
-    ):
-        image = torch.full_like(frame.image, around)
-        image[0, :, 8, 8] = torch.tensor(rgb, dtype=torch.uint8)
-        assert (flag_of(frame.replace(image=image)) == Flag.SPECULAR) == shines, (rgb, around)
-        assert flag_of(frame.replace(image=image), MIDDLE + 1) == 0, "its neighbour is none"
-
-
-def test_confidence_is_that_of_the_return_halved_for_every_doubt():
-    conf = torch.full((1, 16, 16), 2, dtype=torch.uint8)
-    conf[0, 8, 8] = 1
-    step = still(conf=conf)
-    step.depth[:, :, 9:] = 3.0
-    white = still(1.0).image
-    one = lambda frame, **o: float(backproject(frame, MIDDLE, **o).confidence[0, 0])  # noqa: E731
-    assert one(still()) == 1 and one(still(conf=conf)) == 0.5 and one(step) == 0.25
-    assert one(step.replace(image=white)) == 0.125 and one(step.replace(conf=None, image=white)) == 0.25
-    assert one(step.replace(conf=conf * 0)) == 0
-
-
-def test_depth_of_half_precision_is_computed_with_as_pixels_are():
-    for dtype in (torch.float32, torch.float64):
-        frame = still(depth=1.1).replace(depth=torch.full((1, 16, 16), 1.1).half())
-        found = backproject(frame.replace(camera=frame.camera.to(dtype)), MIDDLE.to(dtype), sigma_rel=0.1)
-        assert found.depth.dtype == found.sigma.dtype == found.confidence.dtype == dtype
-        value = torch.tensor(1.1).half().to(dtype)
-        assert found.depth[0, 0] == value and found.sigma[0, 0] == 0.1 * value
-
-
-def test_pixels_outside_of_the_picture_or_no_numbers_find_no_return():
-    """Neither with a search, however far it reaches, unless a return is that near."""
-    frame = still(hw=(16, 24))
+@pytest.mark.parametrize("search", [0, 1, 3, 4])
+def test_pixels_outside_of_the_image_or_no_numbers_find_a_return_within_the_search_alone(search):
     nan, inf = math.nan, math.inf
     places = [
         [nan, nan],
@@ -271,24 +260,21 @@ def test_pixels_outside_of_the_picture_or_no_numbers_find_no_return():
         [5, nan],
         [inf, 3],
         [3, -inf],
+        [-40, 5],
+        [5, 90],
         [-4, 5],
         [27, 5],
         [5, -4],
         [5, 19],
-        [-40, 5],
-        [5, 90],
     ]
-    uv = torch.tensor([places])
-    for search in (0, 1, 3):
-        found = backproject(frame, uv, search_px=search)
-        assert (found.depth == 0).all() and (found.confidence == 0).all() and found.xyz.isnan().all()
-        assert ((found.flag & Flag.NO_DEPTH) != 0).all() and ((found.flag & Flag.BORDER) != 0).all()
-    near = backproject(frame, uv, search_px=4).depth[0] > 0
-    assert near.tolist() == [False] * 5 + [True] * 4 + [False] * 2
+    found = backproject(still(hw=(16, 24)), torch.tensor([places]), search_px=search)
+    none = torch.tensor([[True] * 7 + [search < 4] * 4])
+    assert torch.equal(found.depth == 0, none) and torch.equal((found.flag & Flag.NO_DEPTH) != 0, none)
+    assert found.xyz[none].isnan().all() and ((found.flag & Flag.BORDER) != 0).all()
 
 
-def test_sparse_frames_are_searched_unless_a_radius_is_asked_for():
-    """Among returns at every seventh pixel, frame by frame."""
+def test_sparse_frames_are_searched_by_themselves():
+    """Among returns at every seventh pixel, frame by frame; a radius holds for all."""
     H, W = HW
     depth = torch.zeros(2, H, W)
     depth[:, ::7, ::7] = 2.0
@@ -301,17 +287,29 @@ def test_sparse_frames_are_searched_unless_a_radius_is_asked_for():
         assert torch.equal(getattr(found, field)[0], getattr(wide, field)[0])
         assert torch.equal(getattr(found, field)[1], getattr(none, field)[1])
     assert (wide.depth == 2).all() and int((none.depth == 2).sum()) == 2 * 6 < int((found.depth == 2).sum())
-    two = backproject(frame.replace(sparse=torch.tensor([True, True])), uv, search_px=1)
-    assert torch.equal(two.depth, backproject(frame.replace(sparse=None), uv, search_px=1).depth)
 
 
 def test_a_pixel_outside_of_the_lens_model_has_no_point():
     lens = Camera(torch.tensor([[30.0, 30.0]]), torch.tensor([[8.0, 8.0]]), torch.tensor([[-0.4, 0.0, 0.0, 0.0]]))
-    frame = still(hw=(64, 64)).replace(camera=lens)
     uv = torch.tensor([[10.0, 12.0], [60.0, 60.0]])
     assert cam.undistort(lens, uv[None])[0, 1].isnan().all()
-    found = backproject(frame, uv)
+    found = backproject(still(hw=(64, 64)).replace(camera=lens), uv)
     assert found.usable.tolist() == [[True, False]] and found.confidence.tolist() == [[1, 0]]
     assert found.depth.tolist() == [[1.5, 1.5]]
     ray = cam.undistort(lens, uv[None])[0, 0] - 8
     torch.testing.assert_close(found.xyz[0, 0], torch.tensor([*(1.5 * ray / 30).tolist(), 1.5]))
+
+
+def test_only_pixels_around_the_samples_are_read():
+    """Others may hold anything without changing the answer; also a depth map with a camera of its own is read."""
+    frame, uv = frames(HW)[:1], torch.tensor([[[20.0, 20.0], [24.0, 22.0]]], dtype=torch.float64)
+    near = torch.zeros(HW, dtype=torch.bool)
+    near[11:33, 11:34] = True
+    other = frame.replace(image=frame.image.where(near, torch.nan), depth=frame.depth.where(near, torch.nan))
+    one, two = (classify(f, backproject(f, uv)) for f in (frame, other))
+    for name in ("trackability", "xyz", "flag", "hole", "confidence"):
+        torch.testing.assert_close(getattr(one, name), getattr(two, name), rtol=0, atol=0, equal_nan=True)
+    own = cam.resize(frame.camera, HW, HW)
+    assert torch.equal(backproject(frame.replace(depth_camera=own), uv).depth, one.depth)
+    wide = backproject(frame.replace(depth_camera=own.replace(f=5 * own.f)), uv)  # sees less than the samples
+    assert (wide.depth == 0).all() and ((wide.flag & Flag.NO_DEPTH) != 0).all()

@@ -5,10 +5,9 @@ import torch
 from support.view_estimates import random_estimates
 
 from dhtorch.codes import Gate, Hole, PoseCode
-from dhtorch.experiments.baselines.frozen import AUTO_2
 from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.presets import MAP
+from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Pose, PoseFit, Samples
 from dhtorch.stages.fuse import fuse_consistent
@@ -47,71 +46,52 @@ def left(columns):
     return (torch.arange(W) < columns).expand(H, W)
 
 
-def share(samples, fit, depth, sigma=0.01):
-    return float(reach(samples, fit, depth, sigma)[0])
-
-
-def reach(samples, fit, depth, sigma=0.01, asked=None):
+def reach(samples, fit, depth, sigma=0.01, counted=None):
     one = torch.ones_like(samples.depth)
-    asked = (samples.hole == Hole.TRACKABLE_NO_LIDAR) if asked is None else asked
-    return free_space_violations(samples.uv, samples.depth, fit.inlier, asked, depth * one, sigma * one)
+    counted = (samples.hole == Hole.TRACKABLE_NO_LIDAR) if counted is None else counted
+    return free_space_violations(samples.uv, samples.depth, fit.inlier, counted, depth * one, sigma * one)
 
 
-def test_answers_where_the_sensor_would_have_seen_them_are_counted():
-    samples, fit = scene(left(20))
-    assert share(samples, fit, 1.5) == 1.0 and share(samples, fit, 2.5) == 0.0
-    third = torch.where(torch.arange(N) % W >= 30, 1.5, 3.0)[None]
-    assert share(samples, fit, third) == pytest.approx(0.5, abs=0.05)
+PIXEL, COLUMN = torch.arange(N)[None], torch.arange(N)[None] % W
+V, U = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+STEP = torch.where(torch.arange(W) < 9, 1.0, 3.0)
 
 
-def test_two_sigmas_of_doubt_are_given():
-    samples, fit = scene(left(20))
-    assert share(samples, fit, 1.9, sigma=0.04) == 1.0
-    assert share(samples, fit, 1.9, sigma=0.06) == 0.0
-
-
-def test_half_of_the_returns_say_how_far_the_sensor_sees():
-    depth = torch.where(torch.arange(W) < 9, 1.0, 3.0)
-    samples, fit = scene(left(20), depth)
-    assert share(samples, fit, 2.0) == 1.0, "most returns lie at 3 m"
-    samples, fit = scene(left(15), depth)
-    assert share(samples, fit, 2.0) == 0.0, "most lie at 1 m"
-    few = fit.replace(inlier=fit.inlier & (torch.arange(N)[None] % W >= 9))
-    assert share(samples, few, 2.0) == 1.0, "those that hold the pose lie at 3 m"
-
-
-def test_holes_between_returns_and_a_sparse_sensor_say_nothing():
-    v, u = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
-    samples, fit = scene((u + v) % 5 > 0)
-    assert share(samples, fit, 1.5) == 0.0, "every cell has returns"
-    few = fit.replace(inlier=fit.inlier & (torch.arange(N) % 8 == 0))
-    assert share(samples, few, 1.5) == 0.0, "also where few hold the pose"
-    samples, fit = scene(left(20) & ((u + 2 * v) % 5 == 0))
-    assert share(samples, fit, 1.5) == 0.0, "a sensor that leaves four of five out where it sees"
-
-
-def test_few_answers_or_none_say_nothing():
-    samples, fit = scene(left(20))
-    fit = fit.replace(inlier=fit.inlier & (torch.arange(N) < 9))
-    some = (torch.arange(N) % W == 35) & (torch.arange(N) < 9 * W)
-    assert float(reach(samples, fit, 1.5, asked=some[None])[0]) == 0.0
-    more = (torch.arange(N) % W == 35) & (torch.arange(N) < 10 * W)
-    assert float(reach(samples, fit, 1.5, asked=more[None])[0]) == 1.0
-    nobody = fit.replace(inlier=torch.zeros_like(fit.inlier))
-    assert share(samples, nobody, 1.5) == 0.0
-
-
-def test_where_most_of_what_is_known_holds_the_pose_it_is_no_body_of_its_own():
-    samples, fit = scene(left(21))
-    assert share(samples, fit, 1.5) == 0.0
-    assert share(samples, fit.replace(inlier=fit.inlier & (torch.arange(N) % 2 == 0)), 1.5) == 1.0
-
-
-def test_each_pair_is_checked_alone():
-    a, b = scene(left(20)), scene(left(20), 1.0)
-    samples, fit = collate([a[0], b[0]]), collate([a[1], b[1]])
-    both = reach(samples, fit, 1.5)
-    assert both.tolist() == [share(*a, 1.5), share(*b, 1.5)] == [1.0, 0.0]
+@pytest.mark.parametrize(
+    ("returns", "near", "holds", "depth", "options", "expected"),
+    [
+        # answers where the sensor would have seen them are counted, with two sigmas of doubt
+        (left(20), 2.0, True, 1.5, {}, 1.0),
+        (left(20), 2.0, True, 2.5, {}, 0.0),
+        (left(20), 2.0, True, torch.where(COLUMN >= 30, 1.5, 3.0), {}, 0.5),
+        (left(20), 2.0, True, 1.9, {"sigma": 0.04}, 1.0),
+        (left(20), 2.0, True, 1.9, {"sigma": 0.06}, 0.0),
+        # half of the returns that hold the pose say how far the sensor sees
+        (left(20), STEP, True, 2.0, {}, 1.0),
+        (left(15), STEP, True, 2.0, {}, 0.0),
+        (left(15), STEP, COLUMN >= 9, 2.0, {}, 1.0),
+        # holes between returns say nothing, nor does a sensor that leaves four of five out where it sees
+        ((U + V) % 5 > 0, 2.0, True, 1.5, {}, 0.0),
+        ((U + V) % 5 > 0, 2.0, PIXEL % 8 == 0, 1.5, {}, 0.0),
+        (left(20) & ((U + 2 * V) % 5 == 0), 2.0, True, 1.5, {}, 0.0),
+        # nor do few answers, or none
+        (left(20), 2.0, PIXEL < 9, 1.5, {"counted": (COLUMN == 35) & (PIXEL < 9 * W)}, 0.0),
+        (left(20), 2.0, PIXEL < 9, 1.5, {"counted": (COLUMN == 35) & (PIXEL < 10 * W)}, 1.0),
+        (left(20), 2.0, PIXEL < 0, 1.5, {}, 0.0),
+        # where most of what is known holds the pose it is no body of its own
+        (left(21), 2.0, True, 1.5, {}, 0.0),
+        (left(21), 2.0, PIXEL % 2 == 0, 1.5, {}, 1.0),
+    ],
+)
+def test_answers_in_free_space(returns, near, holds, depth, options, expected):
+    samples, fit = scene(returns, near)
+    fit = fit.replace(inlier=fit.inlier & holds)
+    found = reach(samples, fit, depth, **options)
+    assert float(found) == pytest.approx(expected, abs=0.05)
+    other, other_fit = scene(left(20), 1.0)  # a pair is checked alone
+    both = collate([samples, other]), collate([fit, other_fit])
+    asked = {k: torch.cat((v, v)) if isinstance(v, torch.Tensor) else v for k, v in options.items()}
+    assert reach(*both, depth, **asked)[0] == found[0]
 
 
 def test_a_pair_is_checked_by_the_noise_of_its_far_tracks_and_by_holes_without_a_reason():
@@ -171,10 +151,5 @@ def test_rooms_in_which_near_things_move_have_no_answer(stress, answers):
     """Also where the moving body covers half of the near points."""
     (room,) = open_stress([stress], n_frames=9)
     view = [range_split(room.recording[k], room.near) for k in (0, 3, 6, 8)]
-    method = AUTO_2.replace(n=1536, views=2)  # without the stages that refuse some of these for other reasons
-    found = method(view[0], stack(view[1:]))
-    assert bool(found.keep.any()) == answers
-    if not answers:
-        assert (found.gate == Gate.CONTRADICTED).any()
-        blind = method.replace(triangulate={"max_far_noise": None, "max_in_reach": None})
-        assert blind(view[0], stack(view[1:])).keep.any(), "nothing else silences it"
+    found = AUTO(view[0], stack(view[1:]), n=1536)
+    assert bool(found.keep.any()) == answers and (answers or (found.gate == Gate.CONTRADICTED).any())

@@ -10,7 +10,6 @@ from support.rooms import room
 from support.textures import waves
 
 from dhtorch.pipeline.presets import MAP
-from dhtorch.stages import features
 from dhtorch.stages.features import match_features
 from dhtorch.stages.track import lucas_kanade_affine
 
@@ -70,22 +69,6 @@ def test_the_covariance_is_that_of_a_new_point(noise):
     torch.testing.assert_close(floor, 0.25 * torch.eye(2).expand_as(floor), rtol=1e-2, atol=1e-2)
 
 
-def test_frames_of_matches_say_how_their_surroundings_move():
-    """Local affine frames carry the motion over distances that the matches alone do not."""
-    uv = torch.tensor([[40.0, 40.0], [120.0, 40.0], [40.0, 90.0], [120.0, 90.0]])
-    A = torch.tensor([[1.05, 0.1], [-0.08, 0.95]])
-    frame = torch.tensor([[5.0, 2.0], [0.0, 3.0]])
-    lafs = torch.cat((frame.expand(4, 2, 2), uv[..., None]), -1)[None]
-    moved = torch.cat((A @ lafs[0, :, :, :2], affine(uv)[..., None]), -1)[None]
-    found = features._as_matches(uv, affine(uv), lafs, moved)
-    torch.testing.assert_close(found.A, A.expand(4, 2, 2))
-    empty = features._as_matches(uv, uv, 0 * lafs, moved)
-    torch.testing.assert_close(empty.A, torch.eye(2).expand(4, 2, 2))
-    place, _, ok = features._predict(found, pixels(20)[0], 12, 100.0)
-    torch.testing.assert_close(place, affine(pixels(20)[0]), rtol=0, atol=1e-3)
-    assert not features._predict(found, pixels(20)[0], 12, 0.01)[2].any() and ok.sum() >= 0
-
-
 def test_samples_that_no_match_reaches_are_not_valid():
     half = lambda a, b: tuple(x[(matcher()(a, b)[0][:, 0] < 80)] for x in matcher()(a, b))  # noqa: E731
     tracks = tracked(matcher=half, reach=0.05)
@@ -138,12 +121,6 @@ def test_every_kind_of_matcher_is_called(kind):
     if "LocalFeature" in kind:
         off = (tracks.uv_1 - pixels() - torch.tensor([3.0, -2.0]))[tracks.valid]
         assert tracks.valid.float().mean() > 0.7 and off.abs().median() < 0.7
-
-
-def test_slots_that_a_detector_left_empty_match_nothing():
-    images = waves(1, *HW).float(), waves(1, *HW, shift=(3.0, -2.0)).float()
-    found = features._find_matches(kinds()["a detector and a descriptor"].eval(), *images)
-    assert len(found.uv_0) > 50 and (found.uv_0 > 1).all()
 
 
 def test_another_module_is_refused_by_name():

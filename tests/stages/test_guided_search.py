@@ -146,15 +146,6 @@ def test_the_stated_variance_grows_with_the_noise_of_the_pictures():
     assert noisy.cov[0][both][:, 0, 0].median() > 2 * found.cov[0][both][:, 0, 0].median()
 
 
-def test_a_batch_gives_what_its_pairs_give_alone():
-    (samples, whole, other, T, *_), (more, whole_2, other_2, T_2, *_) = orbit_case(15), orbit_case(25)
-    both = search(*(collate(pair) for pair in ((samples, more), (whole, whole_2), (other, other_2), (T, T_2))))
-    alone = search(samples, whole, other, T), search(more, whole_2, other_2, T_2)
-    for b in range(2):
-        assert torch.equal(both.unique[b], alone[b].unique[0])
-        torch.testing.assert_close(both.uv_1[:, b], alone[b].uv_1[:, 0], equal_nan=True, rtol=0, atol=1e-4)
-
-
 def test_wrong_shapes_and_options_raise():
     samples, whole, other, T, _, _ = orbit_case(15)
     with pytest.raises(ValueError, match="hypotheses is 2"):

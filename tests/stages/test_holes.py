@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.codes import Flag, Hole, Route, first_reason
+from dhtorch.codes import Flag, Hole, Route
 from dhtorch.records import Camera, Frame, Samples
-from dhtorch.stages import holes
 from dhtorch.stages.holes import classify, min_eigenvalue, suggest_route
 
 HW = (24, 32)
@@ -137,15 +136,9 @@ def test_what_to_try_for_each_hole():
     assert suggest_route(hole).dtype == torch.int32
 
 
-def test_the_first_reason_that_holds_is_the_code():
-    a, b = torch.tensor([True, True, False, False]), torch.tensor([True, False, True, False])
-    assert first_reason((a, 5), (b, 3)).tolist() == [5, 5, 3, 0]
-    assert first_reason((b, 3), (a, 5), otherwise=9).tolist() == [3, 5, 3, 9]
-    assert first_reason((a, 1)).dtype == torch.int32
-
-
-def test_a_point_without_a_ray_is_a_hole_whatever_its_depth():
-    xyz = torch.tensor([[[0.1, 0.2, 2.0], [torch.nan, torch.nan, 2.0], [0.1, torch.nan, 2.0]]])
-    flag, textured = torch.zeros(1, 3, dtype=torch.int32), torch.ones(1, 3)
-    classes = holes._classify_holes(xyz, flag, textured, min_trackability=0.5)
-    assert classes.tolist() == [[Hole.NONE, Hole.TRACKABLE_NO_LIDAR, Hole.TRACKABLE_NO_LIDAR]]
+@pytest.mark.parametrize("missing", [[0, 1, 2], [0, 1], [1]])
+def test_a_point_without_a_ray_is_a_hole_whatever_its_depth(missing):
+    frame, samples = taken([0, 0], usable=True)
+    xyz = samples.xyz.clone()
+    xyz[0, 1, missing] = torch.nan
+    assert classify(frame, samples.replace(xyz=xyz)).hole.tolist() == [[Hole.NONE, Hole.TRACKABLE_NO_LIDAR]]

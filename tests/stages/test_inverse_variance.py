@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import time
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Camera, Frame, Samples, TrackHint, Tracks
 from dhtorch.stages.fuse import inverse_variance
-from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 extend_window = PAPER.replace(views=5)
 
@@ -103,51 +101,31 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
     assert len(found.gate.unique()) >= 3 and 5 < int(found.keep.sum()) < 60
 
 
-@pytest.mark.parametrize(("correlation", "V"), [(0.0, 3), (1.0, 2)])
-def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
-    """Own errors of the views equal or independent, the pose's common to all; the chance excess of χ² is shut out."""
-    N = 20000
-    g = torch.Generator().manual_seed(1)
-    draw = lambda *s: torch.randn(*s, generator=g, dtype=torch.float64)  # noqa: E731
-    own, pose = torch.tensor([0.003, 0.005, 0.008][:V]).double()[:, None], 0.004
-    errors = own * (draw(1, N).expand(V, N) if correlation else draw(V, N)) + pose * draw(1, N)
-    depth = 1 / (0.25 + errors)
-    like = torch.ones(V, 1, N, dtype=torch.float64)
-    views = random_estimates(V=V, B=1, N=N, unanswered=0.0).replace(depth=depth[:, None])
-    views = views.replace(
-        sigma=depth[:, None] ** 2 * (own**2 + pose**2).sqrt()[:, None] * like,
-        sigma_shared=depth[:, None] ** 2 * pose,
-    )
-    fused = inverse_variance(views, correlation=correlation, max_sigma_rel=None, max_chi2=1.0)
-    keep = fused.keep[0]
-    assert int(keep.sum()) > 5000
-    z = (1 / fused.depth - 0.25)[0, keep] / (fused.sigma / fused.depth**2)[0, keep]
-    assert float(z.std()) == pytest.approx(1, abs=0.03)
-
-
-def test_limits_hold_at_the_limit_itself():
-    """Inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much."""
-    two = make_estimates([4.0, 2.0], [2.0, 0.5])
-    gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (2.0, 1.9999)]
-    assert gates == [Gate.ANSWER, Gate.INCONSISTENT]
-    same = make_estimates([4.0, 4.0], [0.5, 0.5])
-    gates = [int(inverse_variance(same, max_sigma_rel=x).gate) for x in (0.125, 0.1249)]
-    assert gates == [Gate.ANSWER, Gate.UNCERTAIN]
-    assert (
-        int(inverse_variance(make_estimates([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate) == Gate.INCONSISTENT
-    )
-    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
-    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
-    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
-
-
-def test_a_view_without_a_positive_depth_and_a_finite_sigma_does_not_count():
-    good = inverse_variance(make_estimates([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
-    for depth, sigma in ((-4.0, 0.1), (0.0, 0.1), (4.0, 0.0), (4.0, math.inf), (4.0, math.nan), (math.nan, 0.1)):
-        found = inverse_variance(make_estimates([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
-        assert float(found.depth) == float(good.depth) and int(found.n_views) == 3, (depth, sigma)
-        alone = inverse_variance(make_estimates([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
-        assert int(alone.gate) == Gate.INCONSISTENT, "an answer that cannot be weighed gives no better reason"
+@pytest.mark.parametrize(
+    ("depth", "sigma", "gate", "options", "expected"),
+    [
+        # inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much
+        ([4.0, 2.0], [2.0, 0.5], 0, {"max_chi2": 2.0, "max_sigma_rel": None}, Gate.ANSWER),
+        ([4.0, 2.0], [2.0, 0.5], 0, {"max_chi2": 1.9999, "max_sigma_rel": None}, Gate.INCONSISTENT),
+        ([4.0, 4.0], [0.5, 0.5], 0, {"max_sigma_rel": 0.125}, Gate.ANSWER),
+        ([4.0, 4.0], [0.5, 0.5], 0, {"max_sigma_rel": 0.1249}, Gate.UNCERTAIN),
+        ([4.0, 4 / 3], [1e-9, 1e-9], 0, {"max_sigma_rel": 1e-12}, Gate.INCONSISTENT),
+        ([4.0] * 3, [0.1] * 3, [0, 0, 7], {}, Gate.ANSWER),
+        ([4.0] * 3, [0.1] * 3, [6, 0, 7], {}, Gate.RESIDUAL),
+        ([4.0] * 3, [0.1] * 3, [6, 0, 0], {}, Gate.ANSWER),
+        # a view without a positive depth and a finite sigma does not count
+        *(
+            ([4.0, z], [0.5, s], 0, {"max_sigma_rel": None}, Gate.INCONSISTENT)
+            for z, s in ((-4.0, 0.1), (0.0, 0.1), (4.0, 0.0), (4.0, math.inf), (4.0, math.nan), (math.nan, 0.1))
+        ),
+    ],
+)
+def test_limits_hold_at_the_limit_itself(depth, sigma, gate, options, expected):
+    assert int(inverse_variance(make_estimates(depth, sigma, gate=gate), **options).gate) == expected
+    if gate == 0 and expected == Gate.INCONSISTENT and "max_chi2" not in options and options["max_sigma_rel"] is None:
+        good = inverse_variance(make_estimates([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
+        more = inverse_variance(make_estimates([*depth, 5.0], [*sigma, 0.5]), max_sigma_rel=None)
+        assert float(more.depth) == float(good.depth) and int(more.n_views) == 3
 
 
 def test_one_view_is_its_own_answer_and_none_is_refused():
@@ -173,60 +151,48 @@ def test_a_standstill_is_what_more_than_the_share_of_views_say():
 # ---------------------------------------------------------------------------------------------------- key views
 
 
-def plain_key_views(views, count, good=0.1):
-    """Greedy by loops: the view that adds most to the sum of log(1 + Σ (good · depth / sigma)²), wider of equals."""
-    V, B, N = views.gate.shape
+def plain_key_views(views, count, good, motion):
+    """Greedy by loops: {view: gain} of the views that add most to the sum of log(1 + Σ (good · depth / sigma)²); of equals
+    that of more motion, then the later one."""
     picked = []
-    for b in range(B):
-        worth = [
-            [
-                (good * float(views.depth[v, b, k] / views.sigma[v, b, k])) ** 2 if views.gate[v, b, k] == 0 else 0.0
-                for k in range(N)
-            ]
-            for v in range(V)
-        ]
-        chosen = []
+    for b in range(views.gate.shape[1]):
+        worth = (good * views.depth[:, b] / views.sigma[:, b]).square().where(views.gate[:, b] == 0, 0.0)
+        known, added = torch.zeros_like(worth[0]), {}
         for _ in range(count):
-            totals = {
-                v: sum(math.log1p(sum(worth[c][k] for c in [*chosen, v])) for k in range(N))
-                for v in range(V)
-                if v not in chosen
-            }
-            chosen.append(max(totals, key=lambda v: (totals[v], v)))
-        picked.append(sorted(chosen))
+            left = [v for v in range(len(worth)) if v not in added]
+            gains = {v: float(((1 + known + worth[v]).log() - (1 + known).log()).sum()) for v in left}
+            best = max(left, key=lambda v, b=b, gains=gains: (round(gains[v], 9), float(motion[v, b]), v))
+            added[best], known = gains[best], known + worth[best]
+        picked.append({v: added[v] for v in sorted(added)})
     return picked
 
 
 @pytest.mark.parametrize("good", [0.1, 0.002])
-def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
+@pytest.mark.parametrize("count", range(1, 7))
+def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good, count):
     views = random_estimates(V=6, B=4, N=6, unanswered=0.5, seed=3)
     lone = views.gate.clone()
     lone[:, 0, 1:] = Gate.NO_TRACK
     lone[:, 0, 0] = 0  # all depends on one point, where further views add little
+    lone[:, 1] = Gate.NO_TRACK  # and of one reference view no candidate has an answer
     views = views.replace(gate=lone, depth=views.depth.nan_to_num(4.0), sigma=views.sigma.nan_to_num(0.3))
-    for count in range(1, 7):
-        expected = plain_key_views(views, count, good)
-        assert rank_views(views, count, good_sigma_rel=good).index.T.tolist() == expected
-        if good == 0.1:
-            assert rank_views(views, count).index.T.tolist() == expected
-    for bad in (0, 7):
-        with pytest.raises(ValueError, match="expected 1 to 6"):
-            rank_views(views, bad)
+    for motion in (torch.zeros(6, 4), torch.arange(24.0).view(6, 4) % 7):
+        expected = plain_key_views(views, count, good, motion)
+        options = {} if good == 0.1 else {"good_sigma_rel": good}
+        found = rank_views(views, count, motion=None if not motion.any() else motion, reserve=1, **options)
+        assert found.index.T.tolist() == [list(row) for row in expected]
+        gains = [gain for row in expected for gain in row.values()]
+        assert found.gain.T.flatten().tolist() == pytest.approx(gains, abs=1e-9)
+        if count < 6:
+            further = plain_key_views(views, count + 1, good, motion)
+            added = [next(iter(set(more) - set(few))) for more, few in zip(further, expected, strict=True)]
+            assert found.reserve.tolist() == [added]
 
 
-def test_what_a_view_adds_stands_beside_it():
-    views = random_estimates(V=4, B=3, N=6, unanswered=0.0, seed=1)
-    choice = rank_views(views, 3)
-    worth = (0.1 * views.depth / views.sigma).square()
-    for b in range(3):
-        known, left, added = torch.zeros(6).double(), list(range(4)), {}
-        for _ in range(3):
-            gains = {v: float(((1 + known + worth[v, b]).log() - (1 + known).log()).sum()) for v in left}
-            best = max(left, key=gains.__getitem__)
-            added[best], known = gains[best], known + worth[best, b]
-            left.remove(best)
-        assert choice.index[:, b].tolist() == sorted(added)
-        assert choice.gain[:, b].tolist() == pytest.approx([added[v] for v in sorted(added)])
+@pytest.mark.parametrize("bad", [0, 7])
+def test_wrong_numbers_of_views_raise(bad):
+    with pytest.raises(ValueError, match="expected 1 to 6"):
+        rank_views(random_estimates(V=6), bad)
 
 
 def test_answers_without_a_sigma_add_nothing():
@@ -332,14 +298,6 @@ def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
         assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
 
 
-def test_every_reference_has_its_own_draws_in_all_its_views():
-    stages = RecordingStages()
-    extend_window(stages.reference, stages.others, **stages.stages(), seed=torch.tensor([4, 9]))
-    ((_, _, draws),) = stages.asked["pose"]
-    assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
-    assert not torch.equal(draws[0], draws[1])
-
-
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
     stages = RecordingStages(V=4)
     extend_window(stages.reference, stages.others, **stages.stages())
@@ -371,24 +329,6 @@ def test_the_pyramid_of_the_reference_is_built_once_for_all_views():
     assert part is first.pyramid[1:2] and torch.equal(part(1, 7).levels[0], expected.levels[0][1:2])
 
 
-@pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_affine])
-def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
-    """On one picture that moves by two pixels a view the tracks end at the same places with a chain or without."""
-    wide = torch.nn.functional.interpolate(rand(1, 1, 24, 40, seed=2).float(), size=(96, 160), mode="bicubic")
-    camera = Camera(torch.tensor([[70.0, 70.0]]), torch.tensor([[40.0, 30.0]]))
-    view = lambda x: Frame(wide[..., 10:74, x : x + 80].clamp(0, 1), torch.ones(1, *HW), camera)  # noqa: E731
-    others, ends = stack([view(22), view(24), view(26)]), []
-    for chain in (True, False):
-        trace = {}
-        extend_window(view(20), others, track=track, chain=chain, n=20, hypotheses=4, trace=trace)
-        ends.append([t["tracks"] for t in trace["views"]])
-    for k, (a, b) in enumerate(zip(*ends, strict=True)):
-        both = a.valid & b.valid
-        assert int(both.sum()) > 10
-        assert ((a.uv_1 - b.uv_1)[both].abs() < 0.05).all()
-        assert float((a.uv_0 - a.uv_1)[both][:, 0].median()) == pytest.approx(2 * (k + 1), abs=0.1)
-
-
 def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
     """They are chosen by few of the samples: each reference view has its own choice."""
     n = 512
@@ -415,47 +355,6 @@ def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
         for b in range(2):
             assert torch.equal(second.T_1_from_0.t[2 * k + b], fits[int(known[k, b])].T_1_from_0.t[b])
     assert "pose" not in [c[0] for c in stages.calls] and not stages.asked["pose"]
-
-
-def test_five_views_are_used_by_default_and_no_more_than_that_are_not_chosen_among():
-    for V, options, asked in ((5, {}, 5), (6, {}, 11), (3, {"views": 3}, 3), (3, {"views": 2}, 5)):
-        stages = RecordingStages(V=V)
-        count = []
-        given = stages.stages() | {
-            "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or RecordingStages().tracks(0, uv)
-        }
-        given["pose"] = lambda samples, *_, stages=stages: collate(stages.fits[: len(samples.uv) // 2])
-        given["triangulate"] = lambda samples, *_, stages=stages: stages.answers.map(
-            lambda x: x.flatten(0, 1)[: len(samples.uv), : samples.uv.shape[1]]
-        )
-        extend_window(stages.reference, stages.others, **given, **options)
-        assert len(count) == asked, (V, options)
-
-
-def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
-    """With a clock that advances by as many seconds as it has been read."""
-    # 1 and 2 around the samples, 3 before the first view, 9 and 10 around the joining
-    seconds = {"samples": 2, "track": 4 + 5 + 6, "pose": 7, "triangulate": 8, "fuse": 10}
-    expected = {name: 1e3 * s for name, s in seconds.items()}
-    times = itertools.accumulate(itertools.count(1))
-    monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
-    stages, trace = RecordingStages(), {}
-    extend_window(stages.reference, stages.others, **stages.stages(), trace=trace)
-    assert trace["ms"] == expected
-
-
-def test_what_a_window_asks_by_default():
-    """A texture of 1e-5, 200 hypotheses, the draws of seed 0."""
-    stages = RecordingStages()
-    given = {k: v for k, v in stages.stages().items() if k != "hypotheses"}
-    texture = torch.where(torch.arange(stages.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
-    given["classify"] = lambda _, samples: samples.replace(trackability=texture)
-    extend_window(stages.reference, stages.others, **given)
-    ((_, tracks, draws),) = stages.asked["pose"]
-    for k in range(3):
-        of_view = slice(2 * k, 2 * k + 2)
-        assert torch.equal(tracks.valid[of_view], stages.tracks(k, stages.uv).valid & (texture > 1e-5))
-        assert torch.equal(draws[of_view], uniform_draws(0, 2, 200).float())
 
 
 def test_the_texture_of_a_sample_is_measured_in_every_view():

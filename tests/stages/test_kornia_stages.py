@@ -199,27 +199,6 @@ def test_triangulation_is_papers_to_rounding():
         )
 
 
-@pytest.mark.slow
-def test_the_methods_agree_on_the_built_in_room():
-    """Geometric means over three pairs: coverage of the holes within a tenth, error of their depth within .9 to 1.15."""
-    recording = room(hw=(120, 160), path="walk", n_frames=17, lidar="exact")
-    whole = pytree.collate([recording[k] for k in (0, 4, 8)])
-    source = pytree.collate([recording[k + 6] for k in (0, 4, 8)])
-    numbers = []
-    for method in (PAPER, KORNIA):
-        trace = {}
-        estimate = method(holdout.range_split(whole, 2.0), source, n=512, trace=trace)
-        truth = PAPER.backproject(whole, estimate.uv).depth
-        far = ~trace["samples"].usable & (truth > 0)
-        keep = estimate.keep & far
-        coverage = (keep.sum(1) / far.sum(1)).log().mean().exp()
-        error = torch.where(keep, (estimate.depth - truth).abs() / truth, torch.nan).nanmedian(1).values
-        numbers.append((float(coverage), float(error.log().mean().exp())))
-    coverage, error = zip(*numbers, strict=True)
-    assert min(coverage) > 0.8 and max(error) < 0.2
-    assert 0.9 < coverage[1] / coverage[0] < 1.1 and 0.9 < error[1] / error[0] < 1.15, numbers
-
-
 # ------------------------------------------------------------------------------------------------ gradients
 
 
@@ -299,35 +278,7 @@ def test_gradients_through_a_whole_pair_are_finite(dtype):
         assert gradient.isfinite().all() and (gradient != 0).any()
 
 
-def test_without_a_graph_nothing_asks_for_a_gradient(pair, both):
-    """kornia's groups hold parameters; none of them reaches an answer."""
-    for record in (both[1]["tracks"], both[1]["fit"], both[1]["estimate"]):
-        assert not any(x.requires_grad for x in torch.utils._pytree.tree_leaves(record) if isinstance(x, torch.Tensor))
-    image = pair[0].image.clone().requires_grad_()
-    with torch.no_grad():
-        assert not KORNIA(pair[0].replace(image=image), pair[1], n=64).depth.requires_grad
-
-
-def test_inference_mode_changes_no_bit(pair):
-    grey = [f.replace(image=f.image.mean(1, keepdim=True)) for f in pair]
-    plain = KORNIA(*grey, n=128)
-    with torch.inference_mode():
-        inferred = KORNIA(*(f.map(torch.clone) for f in grey), n=128)
-    assert torch.equal(plain.gate, inferred.gate) and plain.keep.any()
-    assert torch.equal(plain.depth[plain.keep], inferred.depth[plain.keep])
-
-
 # ------------------------------------------------------------------------------------------------ rare inputs
-
-
-@pytest.mark.slow
-def test_a_pair_answers_alone_as_among_others_within_rounding():
-    frames = views(D), views(D, numbers=(14, 1))
-    several = KORNIA(*(pytree.collate([pair[k] for pair in frames]) for k in (0, 1)), n=128)
-    for b, one in enumerate(frames):
-        alone = KORNIA(*one, n=128)
-        assert torch.equal(alone.gate[0], several.gate[b])
-        torch.testing.assert_close(alone.depth[0], several.depth[b], equal_nan=True, rtol=1e-8, atol=0)
 
 
 def test_a_pair_without_a_pose_has_papers_code():
@@ -355,10 +306,6 @@ def test_hopeless_pairs_have_no_answer_and_finite_gradients(pair):
     if total.requires_grad:
         for gradient in torch.autograd.grad(total, images, allow_unused=True):
             assert gradient is None or gradient.isfinite().all()
-
-
-def test_no_samples_make_an_empty_answer(pair):
-    assert KORNIA(*pair, n=0).depth.shape == (1, 0)
 
 
 def test_points_outside_the_picture_stay_where_the_search_would_begin():

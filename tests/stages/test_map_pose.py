@@ -9,7 +9,6 @@ import torch
 import yaml
 from support import dense_reprojection as dense
 from support.pose_problems import map_pose_inputs
-from torch.utils._pytree import tree_leaves
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
@@ -69,16 +68,6 @@ def test_covariance_is_that_of_the_errors(trials, band):
     assert (fit.code == PoseCode.OK).all()
     assert abs(nees(fit, T).mean() - 1) < band  # 1.96 of its deviations are 1.96 sqrt(2 / (6 trials))
     assert abs(fit.sigma_px.mean() / (0.3 * 2.5**0.5) - 1) < 0.05  # the shapes' median mean variance is 2.5
-
-
-def test_sigma_is_the_spread_of_far_depths():
-    args, _, _, z = map_pose_inputs(40, 60, 140)
-    fit = map_pose(*args, isotropic=0.0)
-    estimate = two_view(*args[:2], fit, *args[2:4], max_residual_px=None, fitted_noise=True, isotropic=0.0)
-    far = estimate.keep & (torch.arange(200) >= 60) & (estimate.sigma < 0.1 * z)
-    standard = ((estimate.depth - z) / estimate.sigma)[far]
-    assert len(standard) > 1000 and abs((standard.abs() < 1).double().mean() - 0.68) < 0.05
-    assert (estimate.sigma_shared[far] > 0).all() and (estimate.sigma_shared <= estimate.sigma)[far].all()
 
 
 # ------------------------------------------------------------------------------------------------------- options
@@ -330,21 +319,6 @@ def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
     hidden = map_pose(*put(args, valid=args[1].valid & ~wrong, cov=cov))
     spoilt = map_pose(*put(args, uv_1=uv_1, cov=cov))
     torch.testing.assert_close(hidden.T_1_from_0.t, spoilt.T_1_from_0.t, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_a_pair_with_few_tracks_beside_one_with_many_is_answered_as_alone(dtype):
-    """Bit for bit: a pair is solved on as many tracks as the fullest of its company has."""
-    args, *_ = map_pose_inputs(3, 400, 1400)
-    share = torch.tensor([1.0, 0.3, 0.05])[:, None]
-    used = torch.rand(3, 1800, generator=torch.Generator().manual_seed(4)) < share
-    samples, tracks, *rest = (x.to(dtype) for x in put(args, valid=used))
-    together = map_pose(samples, tracks, *rest)
-    alone = [map_pose(samples[b : b + 1], tracks[b : b + 1], *(x[b : b + 1] for x in rest)) for b in range(3)]
-    assert together.ok.all()
-    for b, fit in enumerate(alone):
-        for one, all_ in zip(tree_leaves(fit), tree_leaves(together), strict=True):
-            assert torch.equal(one[0], all_[b])
 
 
 # ------------------------------------------------------------------------------------------------------ gradients

@@ -105,42 +105,44 @@ def test_a_grid_of_a_long_image_is_one_row_and_that_of_a_tall_one_has_no_more_ro
     assert regular_grid((900, 4), 3, margin_px=1).tolist() == [[1.5, 150.5], [1.5, 449.5], [1.5, 748.5]]
 
 
-@pytest.mark.parametrize("sampler", [spiral, regular_grid, vogel_spiral])
-def test_the_margin_may_leave_one_pixel_and_no_less(sampler):
-    assert sampler((5, 9), 4, margin_px=2)[:, 1].tolist() == [2.0] * 4
-    assert sampler((5, 5), 3).tolist() == [[2.0, 2.0]] * 3, "two pixels by default"
-    assert sampler((5, 5), 0).shape == (0, 2)
-    for n, margin in ((4, 2.01), (4, -0.1)):
-        with pytest.raises(ValueError, match=r"margin_px.* 5x9 pixels"):
-            sampler((5, 9), n, margin_px=margin)
-    with pytest.raises(ValueError, match="n is -1"):
-        sampler((5, 9), -1)
-    assert sampler((50, 90)).shape == (2048, 2)
-    assert sampler((50, 90), 3, dtype=torch.float64).dtype == torch.float64
+SAMPLERS = [spiral, regular_grid, vogel_spiral]
 
 
-@pytest.mark.parametrize("sampler", [spiral, vogel_spiral])
-def test_the_gaze_may_lie_on_the_margin_and_not_beyond(sampler):
-    for gaze in ((2.0, 2.0), (87.0, 47.0)):
-        uv = sampler((50, 90), 9, gaze=gaze)
-        assert uv.amin(0).tolist() >= [2.0, 2.0] and (uv <= torch.tensor([87.0, 47.0])).all()
-    for gaze in ((1.9, 20.0), (20.0, 1.9), (87.1, 20.0), (20.0, 47.1)):
-        with pytest.raises(ValueError, match=r"gaze.* 50x90 pixels"):
-            sampler((50, 90), 9, gaze=gaze)
-
-
-@pytest.mark.parametrize("sampler", [spiral, regular_grid, vogel_spiral])
-def test_a_single_sample_is_one(sampler):
-    (u, v), *others = sampler((50, 90), 1, dtype=torch.float64).tolist()
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_defaults_and_single_samples(sampler):
+    assert sampler((5, 9), 4, margin_px=2)[:, 1].tolist() == [2.0] * 4, "the margin may leave one pixel"
+    assert sampler((5, 5), 3).tolist() == [[2.0, 2.0]] * 3 and sampler((5, 5), 0).shape == (0, 2)
+    first = sampler((50, 90), 3, dtype=torch.float64)
+    assert first.dtype == torch.float64 and sampler((50, 90)).shape == (2048, 2)
+    first.zero_()
+    assert sampler((50, 90), 3).abs().min() > 0, "each call has a tensor of its own"
     reach = 0.0 if sampler is regular_grid else 0.5**0.5  # of the way to the border
-    assert not others
-    if sampler is spiral:
-        np.testing.assert_allclose([[u, v]], plain_spiral((50, 90), 1))
-    else:
-        assert (u, v) == pytest.approx((44.5 + reach * 42.5, 24.5))
+    one = plain_spiral((50, 90), 1)[0] if sampler is spiral else (44.5 + reach * 42.5, 24.5)
+    assert sampler((50, 90), 1, dtype=torch.float64)[0].tolist() == pytest.approx(list(one))
 
 
-def test_a_spiral_needs_a_foveation_above_zero():
-    for bad in (0.0, -1.0):
-        with pytest.raises(ValueError, match="foveation"):
-            spiral((50, 90), 9, foveation=bad)
+@pytest.mark.parametrize("gaze", [(2.0, 2.0), (87.0, 47.0)])
+@pytest.mark.parametrize("sampler", [spiral, vogel_spiral])
+def test_the_gaze_may_lie_on_the_margin(sampler, gaze):
+    uv = sampler((50, 90), 9, gaze=gaze)
+    assert uv.amin(0).tolist() >= [2.0, 2.0] and (uv <= torch.tensor([87.0, 47.0])).all()
+
+
+@pytest.mark.parametrize(
+    ("samplers", "hw", "options", "message"),
+    [
+        (SAMPLERS, (5, 9), {"margin_px": 2.01}, r"margin_px.* 5x9 pixels"),
+        (SAMPLERS, (5, 9), {"margin_px": -0.1}, r"margin_px.* 5x9 pixels"),
+        (SAMPLERS, (5, 9), {"n": -1}, "n is -1"),
+        *(
+            (SAMPLERS[::2], (50, 90), {"gaze": gaze}, r"gaze.* 50x90 pixels")
+            for gaze in ((1.9, 20.0), (20.0, 1.9), (87.1, 20.0), (20.0, 47.1))
+        ),
+        ([spiral], (50, 90), {"foveation": 0.0}, "foveation"),
+        ([spiral], (50, 90), {"foveation": -1.0}, "foveation"),
+    ],
+)
+def test_samples_that_cannot_be_raise(samplers, hw, options, message):
+    for sampler in samplers:
+        with pytest.raises(ValueError, match=message):
+            sampler(hw, **{"n": 9, **options})

@@ -285,12 +285,6 @@ def test_of_several_reasons_the_first_in_the_order_asked_is_named():
         assert row.tolist() == expected
 
 
-def test_a_point_must_lie_in_front_of_both_cameras():
-    samples, tracks, fit = flat(7)
-    solver = told(depth=[4, 0.1, 4, 4, -4, 0, 4.0], depth_1=[3, 3, 0.1, -3, 3, 3, 0.0])
-    assert gates(samples, tracks, fit, solver=solver).tolist() == [[Gate.ANSWER] * 3 + [Gate.BEHIND] * 4]
-
-
 def test_a_point_behind_the_other_camera_alone_is_not_answered():
     """View 1 looks back at the anchor: what the reference view sees far ahead is in front of both, what is near is not."""
     samples, tracks, fit = flat(2)
@@ -304,62 +298,56 @@ def test_a_point_behind_the_other_camera_alone_is_not_answered():
     torch.testing.assert_close(estimate.depth[0, 0], depth[0, 0])
 
 
-def test_parallax_is_in_degrees_and_asked_for_more_than_the_limit():
-    samples, tracks, fit = flat(3)
-    degrees = torch.tensor([0.25, 0.5, 0.75]).double()
-    solver = told(parallax=degrees * math.pi / 180)
-    one = [c[:1] for c in (CAMERA_0, CAMERA_1)]
-    found = two_view(samples, tracks, fit, *one, solver=solver)
-    torch.testing.assert_close(found.parallax_deg[0], degrees)
-    assert found.gate.tolist() == [[Gate.PARALLAX, 0, 0]], "0.3 degrees by default"
-    asked = gates(samples, tracks, fit, solver=solver, min_parallax_deg=float(found.parallax_deg[0, 1]))
-    assert asked.tolist() == [[Gate.PARALLAX, Gate.PARALLAX, 0]]
-    none = told(parallax=[0.0, 1e-9, 0.1])
-    assert gates(samples, tracks, fit, solver=none, min_parallax_deg=0.0).tolist() == [[Gate.PARALLAX, 0, 0]]
-    assert gates(samples, tracks, fit, solver=none, min_parallax_deg=None).tolist() == [[0, 0, 0]]
+def photometric(*values):
+    return {"photometric": torch.tensor([values]).double()}
 
 
-def test_a_residual_reaches_the_limit_and_is_too_large():
-    samples, tracks, fit = flat(4)
-    solver = told(residual_px=[2.75, 2.9999, 3.0, 1e9])
-    assert gates(samples, tracks, fit, solver=solver).tolist() == [[0, 0, Gate.RESIDUAL, Gate.RESIDUAL]]
-    asked = gates(samples, tracks, fit, solver=solver, max_residual_px=2.75)
-    assert asked.tolist() == [[Gate.RESIDUAL] * 4]
-    assert gates(samples, tracks, fit, solver=solver, max_residual_px=None).tolist() == [[0] * 4]
+NARROW = [0.25 * math.pi / 180, 0.5 * math.pi / 180, 0.75 * math.pi / 180]
+PX = torch.tensor([[0.0, 4.9, 5.1, torch.inf]]).double()
+COV = {"cov": torch.diag_embed(torch.stack((PX, PX), -1) ** 2)}  # ten pixels a metre: sigma is a tenth of it
+BAD, WEAK, FLAT = Gate.INCONSISTENT, Gate.PARALLAX, Gate.RESIDUAL
 
 
-def test_a_translation_as_significant_as_asked_for_is_enough():
+@pytest.mark.parametrize(
+    ("solved", "tracked", "options", "expected"),
+    [
+        # a point lies in front of both cameras
+        ({"depth": [4, 0.1, 4, 4, -4, 0, 4.0], "depth_1": [3, 3, 0.1, -3, 3, 3, 0.0]}, {}, {}, [0] * 3 + [Gate.BEHIND] * 4),
+        # parallax is stated in degrees and lies above the limit, 0.3 by default
+        ({"parallax": NARROW}, {}, {}, [WEAK, 0, 0]),
+        ({"parallax": NARROW}, {}, {"min_parallax_deg": float(torch.tensor(NARROW[1]).double().rad2deg())}, [WEAK, WEAK, 0]),
+        ({"parallax": [0.0, 1e-9, 0.1]}, {}, {"min_parallax_deg": 0.0}, [WEAK, 0, 0]),
+        ({"parallax": [0.0, 1e-9, 0.1]}, {}, {"min_parallax_deg": None}, [0, 0, 0]),
+        # a residual that reaches the limit, 3 px by default, is too large
+        ({"residual_px": [2.75, 2.9999, 3.0, 1e9]}, {}, {}, [0, 0, FLAT, FLAT]),
+        ({"residual_px": [2.75, 2.9999, 3.0, 1e9]}, {}, {"max_residual_px": 2.75}, [FLAT] * 4),
+        ({"residual_px": [2.75, 2.9999, 3.0, 1e9]}, {}, {"max_residual_px": None}, [0] * 4),
+        # a mismatch is the grey difference over the root of the texture; without any it is divided by 1e-4
+        ({}, photometric(0.5, 0.51, 2.0, 1e-3, torch.nan), {"max_mismatch_px": 1.0}, [0, BAD, 0, BAD, BAD]),
+        ({}, photometric(0.5, 0.51, 2.0, 1e-3, torch.nan), {"max_mismatch_px": 9.99}, [0, 0, 0, BAD, BAD]),
+        ({}, photometric(0.5, 0.51, 2.0, 1e-3, torch.nan), {"max_mismatch_px": 10.01}, [0, 0, 0, 0, BAD]),
+        ({}, photometric(0.5, 0.51, 2.0, 1e-3, torch.nan), {}, [0] * 5),
+        # sigma relative to depth passes at the limit
+        ({"depth": [5.0] * 4}, COV, {"max_sigma_rel": 0.1}, [0, 0, Gate.UNCERTAIN, Gate.UNCERTAIN]),
+        ({"depth": [5.0] * 4}, COV, {"max_sigma_rel": 0.0}, [0] + [Gate.UNCERTAIN] * 3),
+    ],
+)  # fmt: skip
+def test_gates_at_their_limits(solved, tracked, options, expected):
+    samples, tracks, fit = flat(len(expected))
+    texture = torch.tensor([[0.25, 0.25, 4.0, 0.0, 0.25, 1.0, 1.0]]).double()[:, : len(expected)]
+    solved = told(**{k: torch.tensor(v).double() for k, v in solved.items()})
+    found = gates(samples.replace(trackability=texture), tracks.replace(**tracked), fit, solver=solved, **options)
+    assert found.tolist() == [expected]
+
+
+def test_a_translation_at_the_limit_is_significant_and_the_poses_part_of_sigma_counts():
     samples, tracks, fit = flat(2, batch=4)
-    fit = fit.replace(t_snr=torch.tensor([29.999, 30.0, torch.nan, torch.inf]).double())
+    weak = fit.replace(t_snr=torch.tensor([29.999, 30.0, torch.nan, torch.inf]).double())
     expected = [Gate.NO_BASELINE, 0, Gate.NO_BASELINE, 0]
-    assert gates(samples, tracks, fit, solver=told(), min_t_snr=30.0)[:, 0].tolist() == expected
-    assert gates(samples, tracks, fit, solver=told())[:, 1].tolist() == [0] * 4
-
-
-def test_a_mismatch_is_the_grey_difference_over_the_root_of_the_texture():
-    """At the limit it passes; without any texture it is divided by 1e-4, and one that is no number never passes."""
-    samples, tracks, fit = flat(5)
-    samples = samples.replace(trackability=torch.tensor([[0.25, 0.25, 4.0, 0.0, 0.25]]).double())
-    tracks = tracks.replace(photometric=torch.tensor([[0.5, 0.51, 2.0, 1e-3, torch.nan]]).double())
-    asked = [gates(samples, tracks, fit, solver=told(), max_mismatch_px=x).tolist()[0] for x in (1.0, 9.99, 10.01)]
-    bad = Gate.INCONSISTENT
-    assert asked == [[0, bad, 0, bad, bad], [0, 0, 0, bad, bad], [0, 0, 0, 0, bad]]
-    assert gates(samples, tracks, fit, solver=told()).tolist() == [[0] * 5]
-
-
-def test_sigma_relative_to_depth_passes_at_the_limit():
-    """Ten pixels a metre and tracks of σ px: sigma is σ / 10."""
-    samples, tracks, fit = flat(4)
-    px = torch.tensor([[0.0, 4.9, 5.1, torch.inf]]).double()
-    tracks = tracks.replace(cov=torch.diag_embed(torch.stack((px, px), -1) ** 2))
-    depth_5 = told(depth=[5.0] * 4)
-    asked = gates(samples, tracks, fit, solver=depth_5, max_sigma_rel=0.1)
-    assert asked.tolist() == [[0, 0, Gate.UNCERTAIN, Gate.UNCERTAIN]]
-    asked = gates(samples, tracks, fit, solver=depth_5, max_sigma_rel=0.0)
-    assert asked.tolist() == [[0] + [Gate.UNCERTAIN] * 3]
-    certain = fit.replace(cov=1e-2 * torch.eye(6).double()[None])
-    asked = two_view(samples, tracks, certain, *[c[:1] for c in (CAMERA_0, CAMERA_1)], max_sigma_rel=0.005)
-    assert (asked.gate == Gate.UNCERTAIN).all(), "the pose's part counts"
+    assert gates(samples, tracks, weak, solver=told(), min_t_snr=30.0)[:, 0].tolist() == expected
+    assert gates(samples, tracks, weak, solver=told())[:, 1].tolist() == [0] * 4
+    vague = fit.replace(cov=1e-2 * torch.eye(6).double().expand(4, 6, 6))
+    assert (gates(samples, tracks, vague, max_sigma_rel=0.005) == Gate.UNCERTAIN).all()
 
 
 # ---------------------------------------------------------------------------------------------------- silence
