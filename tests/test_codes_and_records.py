@@ -6,7 +6,7 @@ import torch
 
 from dhtorch import codes, pytree
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source
-from dhtorch.records import Camera, Pose, PoseFit, Samples, SigmaBudget, depth_interval
+from dhtorch.records import Camera, Pose, PoseFit, Samples, SigmaBudget
 
 
 def test_codes_are_named_by_column_alone_and_in_lists():
@@ -84,13 +84,6 @@ def test_a_record_moves_by_position_and_by_name():
     for moved in (one.to(torch.float64), one.to(dtype=torch.float64), one.to("cpu", torch.float64, non_blocking=True)):
         assert moved.f.dtype == moved.c.dtype == torch.float64 and torch.equal(moved.f.float(), one.f)
     assert one.to("cpu").f.dtype == torch.float32 and one.to(device="meta").c.device.type == "meta"
-
-
-def test_an_interval_is_that_of_inverse_depth():
-    depth, sigma = torch.tensor([2.0, 2.0, torch.nan]), torch.tensor([0.2, 1.5, 0.1])
-    low, high = depth_interval(depth, sigma)
-    assert low[:2].tolist() == pytest.approx([2 / 1.2, 2 / 2.5]) and high[0] == pytest.approx(2 / 0.8)
-    assert high[1] == torch.inf and low[2].isnan() and high[2].isnan()
 
 
 def test_a_budget_is_scaled_to_sigma_term_by_term():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dhtorch.alignment import align, error_model
+from dhtorch.alignment import error_model
 from dhtorch.alignment.error_model import ERROR_MODELS, MODEL_HEADS, AlignmentProblem, ErrorModelFit
 from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
 from dhtorch.alignment.references import MetricReferences
@@ -53,13 +53,6 @@ def test_short_fields_are_those_of_near_neighbours():
     assert kernel[0, 0, 1] > kernel[1, 0, 1] > kernel[1, 0, 2] and kernel[0, 0, 2] > kernel[1, 0, 2]
 
 
-def test_freedom_is_less_likely_than_none():
-    prior = {name: model.prior() for name, model in ERROR_MODELS.items()}
-    assert prior["shift"] == prior["scale"] and prior["shift_tilt"] == prior["scale_tilt"] == prior["affine"]
-    assert prior["raw"] == 0 > prior["scale"] > prior["affine"] > prior["affine_tilt"] > prior["affine_long_4"]
-    assert prior["raw"] > prior["raw_tilt"]
-
-
 def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
     references, of = points(), basis()
     size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
@@ -97,26 +90,6 @@ def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
     assert found[3, : len(of.node)].sqrt().max() < 2e-4 and found[3, len(of.node) :].sqrt().mean() > 2e-3
     held = 0.04**2 * field[0, 3, :, error_model.N_TILT_SLOPES :].square().sum(-1)
     torch.testing.assert_close(held + found[3], torch.full_like(held, 0.04**2), rtol=1e-4, atol=0)
-
-
-def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
-    """At the references and at every pixel, of the map whose references they are."""
-    references, of = points(), basis()
-    size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
-    head = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
-    x = torch.ones(1, 120, 160, dtype=torch.float64)
-    task = AlignmentProblem(references, of, head.expand(1, len(MODEL_HEADS), 2), references.x[:, :1])
-    for name, low in (("raw", 0.0), ("raw_tilt", 0.0), ("raw_short_1", 6e-4), ("raw_short_4", 2.4e-3)):
-        fit = ErrorModelFit(
-            model=torch.tensor([[list(ERROR_MODELS).index(name)]]),
-            head=head,
-            beta=torch.zeros(1, 1, size, dtype=torch.float64),
-            spread=torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64),
-            noise=torch.ones(1, 1, 2, dtype=torch.float64),
-            evidence=torch.zeros(1, 1, dtype=torch.float64),
-        )
-        for var in (error_model.predict_references(fit, task)[1], align._predict_map(task, fit, x)[1]):
-            assert low <= float(var.mean().sqrt()) <= 1.5 * low
 
 
 def test_anchors_of_which_there_are_none_are_as_good_as_they_would_have_said():

@@ -20,7 +20,7 @@ from dhtorch.pipeline.dense import (
     sweep_views,
 )
 from dhtorch.pipeline.dense_options import DenseOptions
-from dhtorch.pytree import collate, stack
+from dhtorch.pytree import collate
 from dhtorch.synthetic import SyntheticRoom
 
 #: Where returns end in these tests, m.
@@ -143,17 +143,6 @@ def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
     assert bool((got.gate[got.source == Source.NONE] != Gate.ANSWER).all())
 
 
-@pytest.mark.slow
-def test_more_views_say_more(room, views):
-    others = stack([range_split(room[k], NEAR) for k in (0, 11)])
-    method = MAP.replace(n=512, views=2)
-    with torch.no_grad():
-        one = complete_depth(views[0], others, method=method, planes=48, source_views=1)
-        two = complete_depth(views[0], others, method=method, planes=48, source_views=2)
-    share = [float((m.source == Source.SWEPT).float().mean()) for m in (one, two)]
-    assert share[1] > share[0] > 0.1
-
-
 def test_a_batch_is_a_loop_bit_for_bit():
     torch.set_num_threads(1)
     room = SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(60, 80))
@@ -192,21 +181,6 @@ def test_double_precision_goes_in_beside_pictures_of_bytes():
     for as_given in (lambda x: x.byte(), lambda x: x.float() / 255):
         asked, view = (frame.replace(image=as_given(frame.image)) for frame in (reference, other))
         assert complete_depth(asked, view, **FAST).depth.dtype == torch.float64
-
-
-def test_half_precision_goes_in_and_single_comes_out(views, found):
-    reference, other, depth = views
-
-    def half(frame):
-        image = frame.image.float() / 255 if frame.image.dtype == torch.uint8 else frame.image
-        return frame.replace(image=image.half(), depth=frame.depth.half())
-
-    with torch.no_grad():
-        got = complete_depth(half(reference), half(other), **FAST)
-    assert got.depth.dtype == got.sigma.dtype == torch.float32
-    swept = (got.source == Source.SWEPT) & (found.source == Source.SWEPT)
-    assert swept.sum() > 0.8 * (found.source == Source.SWEPT).sum()
-    assert float(((got.depth - found.depth).abs() / depth)[swept].median()) < 0.01
 
 
 def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they_are(room):

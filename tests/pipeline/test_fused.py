@@ -38,49 +38,41 @@ NONE = answers(1.0, 1.0, keep=False)
 RULES = {"limits": (2.0, 3.0), "factors": (0.6, 2.0)}
 
 
-def joint_depth(joint: fused._Joint) -> float:
-    w = joint.weight
-    return float(1 / (w * joint.sparse.q + (1 - w) * joint.swept.q))
+def answers_of(*stated):
+    return [NONE if one is None else answers(*one) for one in stated]
 
 
-def test_answers_that_agree_become_their_weighted_mean():
-    sparse, swept = answers(4.0, 0.02, n_views=3), answers(4.1, 0.04)
-    joint = fused._join((sparse, NONE), (swept, NONE), **RULES)
-    e_one, e_other = 0.02 / 2**0.5, 0.04
-    weight = e_other**2 / (e_one**2 + e_other**2)
-    assert float(joint.weight) == pytest.approx(weight)
-    assert 1 / joint_depth(joint) == pytest.approx(weight / 4.0 + (1 - weight) / 4.1)
-    assert float(joint.expected) == pytest.approx(0.6 * e_one)
+SURE, WIDE = (4.0, 0.02), (4.0, 0.04)
+WEIGHT = 0.04**2 / (0.02**2 / 2 + 0.04**2)
 
 
-def test_of_answers_that_conflict_the_surer_stands_with_less_certainty():
-    joint = fused._join((answers(4.0, 0.04), NONE), (answers(5.0, 0.02), NONE), **RULES)
-    assert joint_depth(joint) == pytest.approx(5.0)
-    assert float(joint.expected) == pytest.approx(2 * 0.02)
-
-
-def test_between_agreement_and_conflict_the_surer_stands_as_it_is():
-    joint = fused._join((answers(4.0, 0.02), NONE), (answers(4.3, 0.02), NONE), **RULES)
-    z = (1 / 4.0 - 1 / 4.3) / (0.02**2 / 16 + 0.02**2 / 4.3**2) ** 0.5
-    assert 2 < z < 3
-    assert joint_depth(joint) == pytest.approx(4.0) and float(joint.expected) == pytest.approx(0.02)
-
-
-def test_an_uncertain_answer_counts_only_where_one_of_the_other_kind_agrees():
-    alone = fused._join((NONE, answers(4.0, 0.25)), (NONE, NONE), **RULES)
-    assert not bool(alone.keep)
-    apart = fused._join((NONE, answers(4.0, 0.05)), (NONE, answers(9.0, 0.05)), **RULES)
-    assert not bool(apart.keep)
-    together = fused._join((NONE, answers(4.0, 0.25)), (NONE, answers(4.4, 0.3)), **RULES)
-    assert bool(together.keep) and 4.0 < joint_depth(together) < 4.4
-    confirmed = fused._join((answers(4.0, 0.02), NONE), (NONE, answers(4.1, 0.3)), **RULES)
-    assert 4.0 <= joint_depth(confirmed) < 4.01
-
-
-def test_one_answer_alone_stays_as_it_is():
-    for sides in (((answers(4.0, 0.1), NONE), (NONE, NONE)), ((NONE, NONE), (answers(4.0, 0.1), NONE))):
-        joint = fused._join(*sides, **RULES)
-        assert joint_depth(joint) == pytest.approx(4.0) and float(joint.expected) == pytest.approx(0.1)
+@pytest.mark.parametrize(
+    ("sparse", "swept", "depth", "expected"),
+    [
+        # sure and unsure answers of each kind; answers that agree become their weighted mean
+        ((answers(4.0, 0.02, n_views=3), None), ((4.1, 0.04), None), 1 / (WEIGHT / 4.0 + (1 - WEIGHT) / 4.1), 0.6 * 0.02 / 2**0.5),
+        # of answers that conflict the surer stands with less certainty, between agreement and conflict as it is
+        ((WIDE, None), ((5.0, 0.02), None), 5.0, 2 * 0.02),
+        ((SURE, None), ((4.3, 0.02), None), 4.0, 0.02),
+        # an uncertain answer counts only where one of the other kind agrees
+        ((None, (4.0, 0.25)), (None, None), None, None),
+        ((None, (4.0, 0.05)), (None, (9.0, 0.05)), None, None),
+        ((None, (4.0, 0.25)), (None, (4.4, 0.3)), 4.156, None),
+        ((SURE, None), (None, (4.1, 0.3)), 4.0004, None),
+        # one answer alone stays as it is
+        (((4.0, 0.1), None), (None, None), 4.0, 0.1),
+        ((None, None), ((4.0, 0.1), None), 4.0, 0.1),
+    ],
+)  # fmt: skip
+def test_sparse_and_swept_answers_are_joined_by_rules(sparse, swept, depth, expected):
+    sides = [[x if isinstance(x, fused._Answers) else answers_of(x)[0] for x in side] for side in (sparse, swept)]
+    joint = fused._join(*sides, **RULES)
+    assert bool(joint.keep) == (depth is not None)
+    if depth is not None:
+        w = joint.weight
+        assert float(1 / (w * joint.sparse.q + (1 - w) * joint.swept.q)) == pytest.approx(depth, rel=1e-3)
+    if expected is not None:
+        assert float(joint.expected) == pytest.approx(expected)
 
 
 @pytest.fixture(scope="module")
@@ -171,32 +163,21 @@ def inserted(*, weight=1.0, usable=(False, False, False)):
     return fused._insert(swept, at, estimate, selected, joint)  # type: ignore[arg-type]
 
 
-def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
-    got = inserted()
-    assert float(got.depth[0, 1, 1]) == 4.0  # of two samples at a pixel that with the larger score
-    assert bool(got.depth[0, 4, 4].isnan()) and int(got.gate[0, 4, 4]) == Gate.NO_TRACK
-    assert int(got.source[0, 1, 1]) == Source.RECOVERED
-
-
-def test_a_joint_answer_has_the_source_of_larger_weight_and_none_is_at_a_return():
-    assert int(inserted(weight=0.4).source[0, 1, 1]) == Source.SWEPT
-    assert int(inserted(weight=0.6).source[0, 1, 1]) == Source.RECOVERED
-    assert float(inserted(usable=(False, False, True)).depth[0, 1, 1]) == 2.0
-    assert bool(inserted(usable=(True, False, True)).depth[0, 1, 1].isnan())
-
-
-def test_a_joint_depth_is_the_mean_of_inverse_depths():
-    one = torch.ones(1, 2)
-    kinds = [
-        fused._Answers(one.bool(), one / d, 0.1 * one, one, one, one.int(), one.expand(5, 1, 2)) for d in (2.0, 4.0)
-    ]
-    joint = fused._Joint(one.bool(), torch.tensor([[0.5, 0.75]]), one, *kinds)
-    selected = SimpleNamespace(
-        joined=estimate_of(2 * one), samples=SimpleNamespace(usable=torch.zeros(1, 2, dtype=torch.bool))
-    )
-    got = fused._joint_estimate(selected, joint, 0.1)  # type: ignore[arg-type]
-    torch.testing.assert_close(got.depth, 1 / torch.tensor([[0.375, 0.4375]]))
-    torch.testing.assert_close(got.sigma, 0.1 * got.depth)
+@pytest.mark.parametrize(
+    ("options", "depth", "source"),
+    [
+        ({}, 4.0, Source.RECOVERED),  # of two samples at a pixel that with the larger score
+        ({"weight": 0.4}, 4.0, Source.SWEPT),
+        ({"weight": 0.6}, 4.0, Source.RECOVERED),
+        ({"usable": (False, False, True)}, 2.0, Source.RECOVERED),  # none is at a return
+        ({"usable": (True, False, True)}, None, Source.NONE),
+    ],
+)
+def test_joint_answers_stand_in_the_map_beside_answered_pixels(options, depth, source):
+    found = inserted(**options)
+    assert int(found.source[0, 1, 1]) == source
+    assert found.depth[0, 1, 1].isnan() if depth is None else float(found.depth[0, 1, 1]) == depth
+    assert bool(found.depth[0, 4, 4].isnan()) and int(found.gate[0, 4, 4]) == Gate.NO_TRACK
 
 
 def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(views, found):

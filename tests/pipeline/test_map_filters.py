@@ -5,7 +5,6 @@ import torch
 
 from dhtorch.codes import Gate, Source
 from dhtorch.metrics import map_quality
-from dhtorch.pipeline import map_filters
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
 from dhtorch.records import DepthMap
@@ -85,28 +84,6 @@ def test_a_halo_beside_returns_is_silent_and_a_surface_that_goes_on_is_not():
     assert (found.gate[0, 14:20, 30:50] == Gate.UNCERTAIN).all() and found.depth[0, 14:20, 30:50].isnan().all()
     assert not changed(planted, found)[16:44, 60:].any()
     assert changed(planted, planted.filtered(torch.tensor([True])))[14:20, 30:50].sum() == 0, "no evidence if sparse"
-
-
-def test_a_strip_as_wide_as_windows_make_it_is_a_halo_and_a_wider_surface_is_none():
-    r, q = DEFAULT_DENSE_OPTIONS.halo_radius_px, torch.full((1, 30, 60), 1 / 1.5)
-    usable = (torch.arange(60) < 20).expand(1, 30, 60)
-
-    def halo(width):
-        """Columns (60,) silent beside returns of the first twenty, of a swept strip, nothing farther."""
-        swept = ~usable & (torch.arange(60) < 20 + width)
-        known = map_filters._Known(torch.where(usable | swept, q, 0.0), 0 * q, usable, swept)
-        return map_filters._halo(known, usable, DEFAULT_DENSE_OPTIONS)[0, 15].nonzero()[:, 0].tolist()
-
-    assert halo(3) == [20, 21, 22] and halo(2 * r) == []
-
-
-def test_a_neighbour_at_a_depth_is_neither_nearer_nor_farther():
-    which = torch.zeros(1, 5, 5, dtype=torch.bool)
-    which[0, 2, 2] = True
-    of = torch.zeros(1, 5, 5)
-    for other, expected in ((2.0, False), (1.05, True), (0.96, True), (0.5, False)):
-        of[0, 0, 4] = other
-        assert map_filters._has_neighbour(torch.ones(1, 5, 5), which, of, 2, 1.1)[0, 2, 2] == expected, other
 
 
 def test_a_speck_of_returns_is_kept():
@@ -224,26 +201,6 @@ def test_a_wider_silence_amid_returns_is_no_pinhole():
     filled = planted.filtered().source[0] == Source.FILLED
     assert filled[5:10, 30:38].all() and not filled[22:24, 33:35].any() and not filled[43:45, 33:35].any()
     assert planted.filtered(torch.tensor([True])).keep[0, 40:48, 30:38].all(), "no evidence if sparse"
-
-
-def test_each_map_of_a_batch_is_filtered_as_if_alone():
-    first, second = Planted(), Planted()
-    first.plant(slice(20, 24), slice(30, 36))
-    second.depth *= 1 + 0.3 * torch.rand(1, H, W, generator=torch.Generator().manual_seed(0))
-    second.reach_out()
-    second.plant(slice(20, 40), slice(30, 50), 1.5, returned=True, grey=0.9)
-    second.plant(slice(14, 20), slice(30, 50), 1.55)
-    parts = [planted.maps() for planted in (first, second)]
-    swept = DepthMap(
-        *(torch.cat([getattr(s, k) for s, _ in parts]) for k in ("depth", "sigma", "score", "source", "gate"))
-    )
-    returns = SensorReturns(*(torch.cat(columns) for columns in zip(*(r for _, r in parts), strict=True)))
-    grey = torch.cat([first.grey, second.grey])
-    both = filter_map(swept, returns, grey)
-    for b, planted in enumerate((first, second)):
-        alone = planted.filtered()
-        for name in ("depth", "sigma", "score", "source", "gate"):
-            assert torch.equal(getattr(both, name)[b].nan_to_num(-1), getattr(alone, name)[0].nan_to_num(-1))
 
 
 def test_kept_depths_keep_their_gradient_and_filled_ones_have_none():

@@ -164,16 +164,6 @@ def test_replace_changes_a_stage_or_its_options_and_nothing_else():
             PAPER.replace(**wrong)
 
 
-def test_options_are_the_papers_unless_they_are_changed():
-    assert (PAPER.n, PAPER.hypotheses, PAPER.min_trackability) == (2048, 200, 1e-5)
-    assert (PAPER.views, PAPER.chain) == (1, True)
-
-
-def test_options_are_those_of_what_sits_there_now():
-    stage = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
-    assert stage.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is confidence
-
-
 def test_a_pose_from_elsewhere_takes_the_place_of_stage_5(room):
     trace = {}
     found = USUAL(room[0], room[3], trace=trace)

@@ -10,12 +10,11 @@ from support import box_scene as box
 from support import textured_box as walls
 
 from dhtorch import data, extend, pytree
-from dhtorch.codes import Flag, Gate, PoseCode, Source
+from dhtorch.codes import Flag, Gate, PoseCode
 from dhtorch.experiments.baselines import opencv
 from dhtorch.experiments.baselines.device_pose import device_pose_fit, known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.stages import triangulate
 
@@ -64,20 +63,6 @@ def test_exact_scene_gives_pose_and_far_depth(views):
         found = int(far.sum()), float(error.median()), float(se3.rotation_angle(off.R)), float(off.t.norm())
         assert found[0] > 300 and found[1] < 0.03 and (error > 0.1).float().mean() < 0.04, found
         assert found[2] < 6e-3 and found[3] < 2e-2, found
-
-
-def test_map_takes_the_sensor_first(views):
-    (frame_0, frame_1), *_ = views[0]
-    trace = {}
-    estimate = extend(frame_0, frame_1, n=512, trace=trace)
-    samples = trace["samples"]
-    merged = merge(samples, estimate)
-    sensed = samples.xyz.isfinite().all(-1)
-    assert torch.equal(merged.source == Source.SENSOR, sensed)
-    assert torch.equal(merged.source == Source.RECOVERED, estimate.keep & ~sensed)
-    assert torch.equal(merged.depth[sensed], samples.depth[sensed])
-    assert (merged.depth[merged.source == Source.NONE] == 0).all() and merged.depth.isfinite().all()
-    assert set(trace["ms"]) == {"sample", "backproject", "classify", "track", "pose", "triangulate", "score"}
 
 
 # ---------------------------------------------------------------------------------------------------- company

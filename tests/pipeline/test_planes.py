@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Gate, Source
-from dhtorch.pipeline import planes
-from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
+from dhtorch.pipeline.dense_options import DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns
 from dhtorch.pipeline.planes import fill_planes
 from dhtorch.records import DepthMap
@@ -178,22 +177,6 @@ def test_an_unsure_plane_is_silent():
     assert not bool(filled(depth, hole, max_sigma_rel=0.005).keep[hole].any())
 
 
-def test_answers_do_not_depend_on_batch_mates():
-    g = torch.Generator().manual_seed(4)
-    hw = (61, 83)
-    depth = slanted(hw) * (1 + 0.02 * torch.randn(3, *hw, generator=g))
-    silent = torch.rand(3, *hw, generator=g) > torch.tensor([0.3, 0.2, 0.1])[:, None, None]
-    grey = 0.5 + 0.02 * torch.rand(3, *hw, generator=g)
-    together = filled(depth, silent, grey=grey)
-    assert bool((together.source == Source.FILLED).any())
-    for k in range(3):
-        alone = filled(depth[k : k + 1], silent[k : k + 1], grey=grey[k : k + 1])
-        for name in ("depth", "sigma", "score", "source", "gate"):
-            torch.testing.assert_close(
-                getattr(together, name)[k : k + 1], getattr(alone, name), rtol=0, atol=0, equal_nan=True
-            )
-
-
 def test_the_gradient_reaches_the_support():
     depth, hole = slanted().double().requires_grad_(), square()
     after = filled(depth, hole)
@@ -242,47 +225,3 @@ def test_few_cells_are_no_support():
     few = {"min_cell_pixels": 1, "max_plane_sigma_rel": 0.1, "max_plane_disagreement": 1.0}
     sets = [int(filled(depth, silent, min_plane_support=n, **few).keep.sum()) for n in (4, 40)]
     assert sets[0] > sets[1] == int((~silent).sum())
-
-
-def test_support_lies_along_the_rays_from_the_nearest():
-    answered = torch.ones(1, 9, 12, dtype=torch.bool)
-    cells = planes._Cells(*[torch.zeros(1, 9, 12)] * 4, answered, torch.zeros(1, 9, 12))
-    slots = planes._support_slots(cells, DEFAULT_DENSE_OPTIONS)[0, :, 4 * 12 + 5].unflatten(0, (16, 4))
-    assert slots[0].tolist() == [54, 55, 56, 57] and slots[4].tolist() == [65, 77, 89, 101]
-    assert slots[8].tolist() == [52, 51, 50, 49] and slots[2].tolist() == [66, 66, 79, 92]
-
-
-def test_the_fit_is_least_squares_with_its_covariance():
-    g = torch.Generator().manual_seed(5)
-    x, y = (40 * torch.randn(1, 64, 7, generator=g).double() for _ in range(2))
-    q = 0.3 + 4e-4 * x - 2e-4 * y + 0.002 * torch.randn(1, 64, 7, generator=g)
-    exists = torch.rand(1, 64, 7, generator=g) > 0.3
-    support = planes._Support(x, y, q, torch.zeros_like(q), exists)
-    wanted = torch.ones(1, 7, dtype=torch.bool)
-    got = planes._fit_planes(support, wanted, DEFAULT_DENSE_OPTIONS)
-    assert torch.equal(got.n[0], exists[0].sum(0).double())
-    for k in range(7):
-        use = exists[0, :, k]
-        rows = torch.stack([x[0, use, k], y[0, use, k], torch.ones_like(x[0, use, k])], 1)
-        expected = torch.linalg.lstsq(rows, q[0, use, k, None]).solution[:, 0]
-        at = torch.tensor([7.0, -5.0, 1.0]).double()
-        here, there = (torch.full((1, 7), float(v)).double() for v in at[:2])
-        torch.testing.assert_close(got.at(here, there)[0, k], at @ expected)
-        torch.testing.assert_close(got.leverage(here, there)[0, k], at @ torch.linalg.inv(rows.T @ rows) @ at)
-
-
-def test_the_best_hypothesis_is_the_plane_of_most_support():
-    g = torch.Generator().manual_seed(6)
-    x, y = (40 * torch.randn(1, 64, 7, generator=g) for _ in range(2))
-    on_plane = torch.arange(64)[:, None].expand(1, 64, 7) % 3 > 0
-    q = (0.4 + 4e-4 * x - 1e-3 * y) * torch.where(on_plane, 1.0, 1.5)
-    support = planes._Support(x, y, q, torch.zeros_like(q), torch.ones_like(on_plane))
-    wanted = torch.arange(7)[None] < 5
-    inlier = planes._best_hypothesis(support, wanted, DEFAULT_DENSE_OPTIONS)
-    assert torch.equal(inlier, on_plane & wanted[:, None])
-
-
-def test_a_residual_is_weighted_plane_less_weighted_inverse_depth():
-    plane = [torch.full((1, 1), value) for value in (2.0, 3.0, 5.0)]
-    terms = tuple(torch.tensor([values])[..., None] for values in ([1.0, 0.5], [10.0, 5.0], [1.0, 0.5], [7.0, 3.5]))
-    assert planes._residual(plane, terms).flatten().tolist() == [2 + 30 + 5 - 7, 15.0]

@@ -71,12 +71,6 @@ def test_rows_do_not_depend_on_the_batch(room, outcome):
     assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
 
 
-@pytest.mark.slow
-def test_rows_do_not_depend_on_the_workers(room, outcome):
-    again = pair.run([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, workers=2))
-    assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
-
-
 def _told(outcome):
     """Rows of pairs without their times."""
     return [{k: v for k, v in row.items() if k != "ms"} for row in outcome.rows if row["pair"] is not None]
@@ -114,13 +108,6 @@ def test_why_is_said_in_one_line(caplog):
     assert report_selection(0, (1,), {}) == ViewReport(0, (1,), 1) and str(report_selection(0, (1,), {})).endswith(
         "1, all that were offered"
     )
-
-
-def test_each_anchor_of_a_batch_is_told_of_its_own():
-    index, gain = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    no_answer = torch.tensor([[False, True]] * 4)
-    found = report_selection(7, (4, 9, 20, 31), {"choice": ViewSelection(index, gain, no_answer)}, b=1)
-    assert found == ViewReport(7, (9, 20), 4, (2.0, 4.0), 4)
 
 
 def test_what_a_view_adds_and_which_say_nothing(room):

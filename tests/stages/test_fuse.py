@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from dhtorch.pipeline import view_selection
 from dhtorch.pipeline.view_selection import downscale_frame, select_views_by_preview
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Frame, Pose, Tracks
-from dhtorch.stages.fuse import fuse_consistent
+from dhtorch.stages.fuse import fuse_consistent, inverse_variance
 from dhtorch.stages.sample import spiral
 from dhtorch.synthetic import open_room
 
@@ -147,14 +148,15 @@ def test_a_single_partner_is_its_own_answer_and_none_is_refused():
         fuse_consistent(views[:0])
 
 
-def test_gradients_are_finite_and_right():
+@pytest.mark.parametrize("fuse", [fuse_consistent, partial(inverse_variance, max_sigma_rel=None, max_chi2=1e9)])
+def test_gradients_are_finite_and_right(fuse):
     views = random_estimates(N=6, spread=1.0)
-    keep = fuse_consistent(views).keep
+    keep = fuse(views).keep
     assert int(keep.sum()) > 3
 
     def answer(depth, sigma):
-        found = fuse_consistent(views.replace(depth=depth, sigma=sigma))
-        return found.depth[keep], found.sigma[keep]
+        found = fuse(views.replace(depth=depth, sigma=sigma))
+        return found.depth[keep], found.sigma[keep], found.residual_px[keep]
 
     depth, sigma = (x.nan_to_num(1.0).requires_grad_() for x in (views.depth, views.sigma))
     assert torch.autograd.gradcheck(answer, (depth, sigma), eps=1e-7, atol=1e-5)
