@@ -151,7 +151,6 @@ def register_affine(
         ValueError: wrong shapes.
 
     Gradient: none; apply :func:`registration_step` to the result.
-    Twin: ``register_affine`` of ``tests/support/reference.py``, one point at a time.
     Cost: one patch of image 1 per point, and 441 samples of it per point and step.
     """
     B, N = (
@@ -197,7 +196,6 @@ def registration_step(
         ValueError: wrong shapes.
 
     Gradient: to both pyramids and ``uv_0``; ``uv_1`` and ``linear`` are detached.
-    Twin: ``register_step`` of ``tests/support/reference.py``.
     """
     B, N = (
         check("registration_step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k]

@@ -11,8 +11,7 @@ C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is compute
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same search without maps, one point at a time: ``search`` of ``tests/support/reference.py``. The whole search
-has a compiled kernel.
+The whole search has a compiled kernel.
 """
 
 from __future__ import annotations

@@ -54,7 +54,6 @@ def reduce_patches(
         ValueError: wrong shapes, or an image smaller than a patch.
 
     Gradient: to the image, through ``reduce``.
-    Twin: ``patch`` of ``tests/support/reference.py``, one point at a time.
     """
     sizes = check("reduce_patches", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
@@ -260,7 +259,6 @@ def sample_nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Grid (B, h, w) and points ``uv`` (B, N, 2) -> values (B, N) at the nearest pixels, and whether these exist.
 
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
-    Twin: ``nearest`` of ``tests/support/reference.py``.
     """
     sizes = check("sample_nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
     index, inside = nearest_pixel_index((sizes["h"], sizes["w"]), containing_pixels(uv))

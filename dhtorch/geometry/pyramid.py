@@ -173,7 +173,6 @@ def build_pyramid(
         ValueError: not an image batch, ``levels`` < 1, a window that is even or < 3, or an image no larger than it.
 
     Gradient: to the image.
-    Twin: ``levels`` of ``tests/support/reference.py``.
     """
     sizes = check("build_pyramid", image=(image, "B C H W"))
     if sizes["C"] not in (1, 3):

@@ -97,7 +97,6 @@ def lucas_kanade(
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
     against ``cv2.calcOpticalFlowPyrLK`` (``tests/stages/test_track.py``).
-    Twin: ``lucas_kanade`` of ``tests/support/reference.py``, one point at a time.
 
     Example:
         >>> import torch

@@ -1,7 +1,4 @@
-"""Textures with an exact motion, and pyramid levels made, filtered and padded by OpenCV.
-
-The searches are checked against ``support/reference.py``; that, and the pyramid, against these levels.
-"""
+"""Textures with an exact motion, and pyramid levels made, filtered and padded by OpenCV."""
 
 import cv2
 import numpy as np
