@@ -1,6 +1,5 @@
 """Gradients through the stages: what they recover, and that compiled graphs, vmap, forward and reverse mode agree."""
 
-import math
 import shutil
 from functools import partial
 
@@ -12,7 +11,6 @@ from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as torch_pytree
 
 from dhtorch import MAP, PAPER, extend, pytree
-from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import holdout
 from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws
 from dhtorch.pipeline.presets import METHODS
@@ -370,126 +368,6 @@ def test_a_window_of_half_precision():
 
 
 # --------------------------------------------------------------------------------------------- what they recover
-
-
-class Task:
-    """Far depth of a few pairs against held-back truth; tracks do not depend on what is looked for, so they stay.
-
-    Two rooms leave the principal point open by some pixels, whatever tracks them; four hold it within two.
-    """
-
-    rooms = (2, 3, 4, 5)
-
-    def __init__(self, n=512):
-        rooms = [room(seed, hw=(180, 240)) for seed in self.rooms]
-        pairs = [views(each, 0, 16, dtype=torch.float32) for each in rooms]
-        whole = pytree.collate([each[0] for each in rooms])
-        self.near, self.other = (pytree.collate(frames) for frames in zip(*pairs, strict=True))
-        self.method = METHODS["map"].replace(n=n, pose={"shutter_sigma": 0.0})  # a global shutter
-        trace = {}
-        self.method(self.near, self.other, trace=trace)
-        self.tracks, self.samples = trace["tracks"], trace["samples"]
-        truth = holdout.sample_truth(whole, self.samples.uv)
-        self.far = holdout.select_candidates(self.samples, truth, 2.0).ok
-        self.here = holdout.select_candidates(self.samples, truth, 0.0).ok & ~self.far
-        self.truth = torch.where(self.far, truth.depth, 1.0)
-        assert int(self.far.sum()) > 100
-
-    def ask(self, camera, depth):
-        near = self.near.replace(camera=camera, depth=depth, depth_camera=None)
-        return self.method(near, self.other.replace(camera=camera), track=lambda *_, **__: self.tracks)
-
-
-def fit(residual, start, *, scale=0.03, prior=0.0, steps=25):
-    """Levenberg–Marquardt on a robust cost (Geman–McClure); residual(p) → (residuals, (who counts, residuals))."""
-
-    def cost(p):
-        r, (counts, _) = residual(p)
-        return float(torch.where(counts, r * r / (r * r + scale * scale), 1.0).sum() + prior * p.square().sum())
-
-    p, damping, least = start, 1e-2, cost(start)
-    for _ in range(steps):
-        J, (counts, r) = jacfwd(residual, has_aux=True)(p)
-        w = counts / (1 + (r / scale) ** 2) ** 2 / scale**2
-        H = (J.T * w) @ J + prior * torch.eye(len(p), dtype=p.dtype)
-        g = (J.T * w) @ r + prior * p
-        for _ in range(6):
-            proposal = p - torch.linalg.solve(H + damping * torch.diag(H.diagonal()), g)
-            found = cost(proposal)
-            if found < least:
-                break
-            damping *= 10
-        else:
-            return p
-        converged = least - found < 1e-6 * least
-        p, least, damping = proposal, found, damping / 10
-        if converged:
-            return p
-    return p
-
-
-@pytest.fixture(scope="module")
-def task():
-    return Task()
-
-
-def relative(estimate, truth, counts):
-    """Logarithm of answered over true depth, 0 where it does not count; with who counts."""
-    counts = estimate.keep.detach() & counts
-    r = torch.where(counts, estimate.depth, truth).log() - truth.log()
-    return r.flatten(), (counts.flatten(), r.detach().flatten())
-
-
-@pytest.mark.slow  # the derivatives it goes by are checked above; notebooks/4_gradients.ipynb shows both
-@pytest.mark.parametrize("sign", [1, -1])
-def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign):
-    f, c = task.near.camera.f, task.near.camera.c
-
-    def camera(p):
-        return Camera(f * p[:1].exp(), c + p[1:] * f)
-
-    def residual(p):
-        return relative(task.ask(camera(p), task.near.depth), task.truth, task.far)
-
-    off = 0.05 * c[0] / f[0]
-    start = torch.stack((torch.tensor(math.log(1 + sign * 0.05)), sign * off[0], -off[1]))
-    before = residual(start)[1]
-    p = fit(residual, start)
-    after = residual(p)[1]
-    assert abs(float(p[0].exp() - 1)) < 0.01, "focal length within a fifth of its error"
-    assert float((p[1:] * f[0]).abs().max()) < 2.0, "principal point within 2 px, from 6 and 4.5"
-    median = [float(r[counts].abs().median()) for counts, r in (before, after)]
-    assert median[1] < 0.2 * median[0] and median[1] < 0.01
-
-
-@pytest.mark.slow
-def test_a_wrong_scale_of_near_depth_is_recovered_pixel_by_pixel(task):
-    """The sensor lies by a smooth field, 1 % to 11 %; far truth fixes its mean, near triangulation its shape."""
-    hw = task.near.depth.shape[-2:]
-
-    def field(theta):
-        coarse = theta.view(1, 1, 3, 4)
-        return torch.nn.functional.interpolate(coarse, size=hw, mode="bilinear", align_corners=True)[:, 0]
-
-    true = torch.linspace(0.01, 0.11, 12)
-    lying = task.near.depth * field(true).exp()
-
-    def residual(theta):
-        depth = lying * (-field(theta)).exp()
-        estimate = task.ask(task.near.camera, depth)
-        told, _ = sample_nearest(depth, task.samples.uv)
-        return relative(
-            estimate, torch.where(task.far, task.truth, torch.where(task.here, told, 1.0)), task.far | task.here
-        )
-
-    def left(theta):
-        wrong, _ = sample_nearest((field(true) - field(theta)).expand(len(lying), -1, -1), task.samples.uv)
-        return float(wrong[task.here].abs().median())
-
-    start = torch.zeros(12)
-    theta = fit(residual, start, prior=1.0)
-    assert left(start) > 0.04
-    assert left(theta) < 0.015
 
 
 @pytest.mark.parametrize("method", [PAPER, MAP], ids=["paper", "map"])

@@ -1,6 +1,5 @@
 """Our values as kornia's and back: cameras, motions, and what both say of the same points; kornia's functions here."""
 
-import json
 import re
 import subprocess
 import sys
@@ -9,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from kornia.geometry.calibration import undistort_points
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from kornia.geometry.vector import Vector3
@@ -27,12 +25,6 @@ from dhtorch import Camera, Pose
 from dhtorch.data import convert
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pipeline.presets import METHODS
-from dhtorch.synthetic import SyntheticRoom
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-import beside_kornia
 
 REPO = Path(__file__).resolve().parents[2]
 PAGE = (REPO / "docs/kornia.md").read_text(encoding="utf-8")
@@ -150,79 +142,9 @@ def test_quaternions_and_matrices_by_kornia_are_those_of_the_exponential_map():
     assert convert.to_c2w(q[:0], vectors[:0], Path("poses")).shape == (0, 4, 4)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_kornias_functions_that_are_used_give_the_bits_of_the_formulas_that_they_replaced(dtype):
-    camera, uv = cameras(dtype), 160 * torch.rand(B, 500, 2, generator=torch.Generator().manual_seed(3)).to(dtype)
-    camera = camera.replace(distortion=0.02 * camera.distortion)
-    depth = 1 + points(500, dtype)[..., 2]
-    arguments = {
-        "geometry.camera.unproject": (camera, uv, depth),
-        "geometry.se3.hat": (points(500, dtype),),
-        "geometry.filters.grayscale": (torch.rand(B, 3, *HW, dtype=dtype),),
-    }
-    used = {p.ours: p for p in beside_kornia.PEERS if p.used == "kornia"}
-    assert used.keys() == arguments.keys()
-    for name, peer in used.items():
-        mine, theirs = peer.mine(*arguments[name]), peer.theirs(*arguments[name])
-        assert torch.equal(mine, theirs) and mine.isfinite().all(), name
-    assert torch.equal(cam.rays(camera, uv), used["geometry.camera.unproject"].mine(camera, uv, depth**0))
-
-
-@pytest.mark.parametrize("method", ["paper", "map"])
-def test_methods_enter_kornias_geometry(method):
-    room = SyntheticRoom(seed=2, n_frames=6, hw=HW, depth_hw=(48, 64))
-    entered = set()
-
-    def profile(frame, event, _):
-        if event == "call" and "/kornia/" in frame.f_code.co_filename:
-            entered.add(frame.f_code.co_name)
-
-    sys.setprofile(profile)
-    try:
-        METHODS[method](room[0], room[3])
-    finally:
-        sys.setprofile(None)
-    assert {"unproject_points", "rgb_to_grayscale"} <= entered
-    assert ("hat" in entered) == (method == "map")
-
-
-def test_behind_a_wide_lens_kornias_steps_have_not_arrived():
-    camera = Camera(
-        torch.full((1, 2), 300.0), torch.tensor([[320.0, 240.0]]), torch.tensor([[-0.45, 0.2, 0.001, 0.001]])
-    )
-    uv = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([640.0, 480.0])
-    ideal, theirs = cam.undistort(camera, uv), undistort_points(uv, cam.to_matrix(camera), camera.distortion)
-    assert ideal.isfinite().all() and (cam.distort(camera, ideal) - uv).abs().max() < 0.01
-    assert ((theirs - ideal).abs().amax(-1) > 0.1).float().mean() > 0.4
-
-
 def test_kornia_is_loaded_with_the_methods_and_not_with_the_package():
     code = "import sys, dhtorch, dhtorch.data; dhtorch.Frame; print('kornia' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
-
-
-def test_the_result_has_a_row_for_every_pair_of_functions_and_kornias_are_used_where_they_cost_nothing():
-    rows = json.loads((REPO / "benchmarks/results/kornia.json").read_text())
-    assert [(p.ours, p.kornia, p.used, p.why) for p in beside_kornia.PEERS] == [
-        (r["name"], r["kornia"], r["used"], r["why"]) for r in rows
-    ]
-    for row in rows:
-        free = max(row["added_percent"].values()) < beside_kornia.MAX_ADDED_PERCENT
-        assert (row["used"] == "kornia") == (free and row["largest"] == 0), row["name"]
-    assert f"adds less than {beside_kornia.MAX_ADDED_PERCENT} %" in PAGE.replace("\n", " ")
-
-
-def test_the_page_lists_the_functions_that_are_imported_from_kornia():
-    """Outside the stages that are written on it, the adapters and the experiments; classes (without "_") convert."""
-    imported = set()
-    for path in (REPO / "dhtorch").rglob("*.py"):
-        if not {"kornia", "transforms", "features.py", "experiments"} & set(path.relative_to(REPO).parts):
-            for names in re.findall(r"from kornia\.\S+ import ([\w, ]+)", path.read_text(encoding="utf-8")):
-                imported |= {name.strip() for name in names.split(",") if "_" in name and not name.strip().isupper()}
-    table = PAGE.partition("## Function by function")[2].partition("The next table")[0]
-    first_column = "".join(row.split("|")[1] for row in table.splitlines() if row.startswith("| "))
-    listed = set(re.findall(r"`(?:\w+\.)*(\w+)`", first_column))
-    assert listed == imported | {"hat"}
 
 
 @pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGE, re.S))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dhtorch.data.io.decode import to_metres
-from dhtorch.geometry.no_depth import clear_far_constant, clear_no_depth, clear_saturated
+from dhtorch.geometry.no_depth import clear_far_constant, clear_no_depth
 from dhtorch.transforms import SampleSpec
 
 
@@ -85,27 +85,3 @@ def test_a_few_pixels_at_the_largest_depth_are_kept():
     depth = scene()
     depth.view(-1)[: depth.numel() // 200] = 20.0
     assert torch.equal(clear_far_constant(depth), depth)
-
-
-def test_each_map_of_a_batch_has_a_far_constant_of_its_own():
-    depth = torch.stack([scene(), scene(), scene()])
-    depth[0, :15], depth[1, :15] = 100.0, 50.0
-    cleared = clear_far_constant(depth)
-    assert torch.equal(cleared, torch.stack([clear_far_constant(one) for one in depth]))
-    assert [int((one == 0).sum()) for one in cleared] == [15 * 80, 15 * 80, 0]
-    assert torch.equal(torch.func.vmap(clear_no_depth)(depth), cleared)
-
-
-def test_gradient_reaches_the_values_kept():
-    depth = scene().double()
-    depth[:15], depth[20] = 100.0, torch.nan
-    depth.requires_grad_()
-    (slope,) = torch.autograd.grad(clear_no_depth(depth).sum(), [depth])
-    kept = torch.ones(60, 80).double()
-    kept[:15], kept[20] = 0.0, 0.0
-    assert torch.equal(slope, kept)
-
-
-def test_other_numbers_are_returned_as_they_are():
-    depth = scene()
-    assert clear_saturated(depth) is depth and clear_far_constant(depth) is depth

@@ -45,12 +45,6 @@ def wall(depth, t, *, angle=(0.0, 0.0, 0.0), hw=(96, 128), slope=0.0, dtype=torc
     return base, plane_sweep.SweptView(seen, camera, T), q.unflatten(-1, hw)
 
 
-def test_bits_are_counted():
-    x = torch.randint(0, 2**31 - 1, (500,), generator=generator(), dtype=torch.int32)
-    x = torch.cat([x, torch.tensor([0, 1, 2**31 - 1], dtype=torch.int32)])
-    assert plane_sweep.count_set_bits(x).tolist() == [int(v).bit_count() for v in x]
-
-
 def test_a_census_compares_31_neighbours_with_the_middle():
     image = texture(12, 15)
     code = plane_sweep.census_transform(image)[0]

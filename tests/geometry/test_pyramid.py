@@ -1,7 +1,6 @@
 """Pyramids of windows, against OpenCV's levels, kornia's filters and bilinear reading written out."""
 
 import cv2
-import kornia
 import numpy as np
 import pytest
 import torch
@@ -35,20 +34,6 @@ def test_levels_are_opencvs_mirrored_beyond_the_border_with_scharrs_gradients(hw
             np.testing.assert_allclose(found.levels[k][b].numpy(), np.stack(want.planes), atol=1e-12)
 
 
-def test_the_next_level_is_kornias_blur_at_even_pixels_and_gradients_are_its_scharr():
-    image = noise(2, 1, 40, 51)
-    found = build_pyramid(image, 2, 5)
-    inner = slice(found.pad, -found.pad)
-    grey = found.levels[1][:, GREY_PLANE, inner, inner]
-    binomial = torch.tensor([[1.0, 4, 6, 4, 1]], dtype=torch.float64) / 16
-    blurred = kornia.filters.filter2d_separable(image, binomial, binomial, border_type="reflect")
-    torch.testing.assert_close(grey, blurred[:, 0, ::2, ::2])
-    v, u = torch.meshgrid(*(torch.arange(s, dtype=torch.float64) for s in (30, 40)), indexing="ij")
-    slope = build_pyramid((0.003 * u + 0.007 * v)[None, None], 1, 5).levels[0][0, 1:, 20:-20, 20:-20]
-    assert slope.numel() and torch.allclose(slope[0], slope.new_tensor(0.003))
-    assert torch.allclose(slope[1], slope.new_tensor(0.007)), "per pixel"
-
-
 def test_colours_and_bytes_become_grey_first():
     rgb = torch.randint(0, 256, (2, 3, 30, 33), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     found = build_pyramid(rgb, 2, 5)
@@ -76,11 +61,6 @@ def test_no_level_is_smaller_than_the_window_or_its_padding(window, least):
     for small in ((least - 1, 90), (90, least - 1)):
         with pytest.raises(ValueError, match="too small for window"):
             build_pyramid(noise(1, 1, *small), 4, window)
-
-
-def test_a_batch_without_images_has_levels_without_images():
-    found = build_pyramid(torch.zeros(0, 3, 48, 64, dtype=torch.uint8), 2, 11)
-    assert [x.shape for x in found.levels] == [(0, 3, 48 + 26, 64 + 26), (0, 3, 24 + 26, 32 + 26)]
 
 
 def test_as_many_levels_are_made_as_asked_for():

@@ -99,21 +99,6 @@ def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
     assert reprojection_problem.whitened_residuals(problem, linear, NOISE).isfinite().all()
 
 
-def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
-    """The inverse depth of a far track is then free by metres, and yet eliminated."""
-    problem, at = pose_depth_problem(off=0.0, turn=0.0)
-    at = at._replace(T=se3.Pose(at.T.R, 3e-4 * at.T.t))
-    Y = at.T.R @ problem.ray + problem.inverse[:, None] * at.T.t[..., None]
-    uv = Y[:, :2] / Y[:, 2:] * problem.f[..., None] + problem.c[..., None]
-    problem = problem.replace(uv=uv)
-    rows = reprojection_problem.whitened_residuals(problem, reprojection_problem.linearise_tracks(problem, at), NOISE)
-    for b, tracks in enumerate(every(problem, at)):
-        for k in FAR:
-            assert tracks[k].front and tracks[k].v == np.inf and tracks[k].s @ tracks[k].W @ tracks[k].s < 0.1
-            gram = rows[b, :, :, k] @ rows[b, :, :, k].T
-            np.testing.assert_allclose(gram, tracks[k].gram, rtol=0, atol=1e-6 * np.abs(tracks[k].gram).max())
-
-
 # ------------------------------------------------------------------------------------------------ all tracks
 
 
@@ -190,41 +175,6 @@ def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
     )
     assert not (held.g - free.g)[:, :6].any()
     assert reprojection_problem.shutter_prior(precision)[1].tolist() == [0.0] * 6 + [3e5] * 3
-
-
-def test_elimination_is_the_schur_complement_of_the_whole_problem():
-    """Every residual of pixels and depths as one function of pose, turn and inverse depths, differentiated as a whole."""
-    problem, at = pose_depth_problem(off=1e-3, turn=0.0)
-    used = [k for k in range(N) if k not in (3, BEYOND, EPIPOLE, BEHIND, UNUSED)]
-    problem = problem.map(lambda x: x[..., used] if x.shape[-1] == N else x)
-    noise, n = NOISE[:, used], len(used)
-    _, H, g = reprojection_problem.pose_normal_equations(
-        problem, at, noise, torch.ones(2, dtype=D), torch.zeros(2, dtype=D), kernel=None, bend=1.0
-    )
-    for b in range(2):
-        ray, near = problem.ray[b].T, problem.near[b]
-        xx, xy, yy = problem.shape[b] * noise[b]
-        whiten = torch.linalg.inv(torch.linalg.cholesky(torch.stack((xx, xy, xy, yy), -1).view(n, 2, 2)))
-
-        def every_residual(x, b=b, ray=ray, near=near, whiten=whiten):
-            pose, q = se3.retract(at.T[b : b + 1], x[None, :6]), x[9:]
-            Y = ray @ pose.R[0].T + q[:, None] * pose.t[0]
-            Y = Y + torch.linalg.cross((ray[:, 1:2] / ray[:, 2:]) * x[6:9], Y)
-            miss = Y[:, :2] / Y[:, 2:] * problem.f[b] + problem.c[b] - problem.uv[b].T
-            prior = (q - problem.inverse[b]) / problem.variance[b].sqrt()
-            return torch.cat(((whiten @ miss[..., None]).flatten(), prior[near]))
-
-        x = torch.cat((torch.zeros(9, dtype=D), problem.inverse[b]))
-        for _ in range(8):  # far tracks at their optimum, near ones where the sensor says
-            J, r = torch.func.jacrev(every_residual)(x), every_residual(x)
-            step = torch.linalg.solve(J[:, 9:].T @ J[:, 9:], J[:, 9:].T @ r)
-            x = torch.cat((x[:9], torch.where(near, x[9:], x[9:] - step)))
-        J, r = torch.func.jacrev(every_residual)(x), every_residual(x)
-        A, v = J.T @ J, J.T @ r
-        back = A[:9, 9:] @ torch.linalg.inv(A[9:, 9:])
-        reduced, right = A[:9, :9] - back @ A[9:, :9], v[:9] - back @ v[9:]
-        torch.testing.assert_close(H[b], reduced, rtol=0, atol=1e-7 * float(reduced.abs().max()))
-        torch.testing.assert_close(g[b], right, rtol=0, atol=1e-5 * float(right.abs().max()))
 
 
 # ------------------------------------------------------------------------------------------------ steps

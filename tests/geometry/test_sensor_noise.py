@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from dhtorch.data import FORMATS
-from dhtorch.geometry.sensor_noise import SENSORS, get_sensor_noise, sensor_of_format
+from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.stages.backproject import backproject
@@ -65,9 +64,3 @@ def test_what_is_no_sensor_is_refused_in_one_line(sensor):
     with pytest.raises(ValueError, match=r"sensor: found .*, expected ") as raised:
         get_sensor_noise(sensor)
     assert "\n" not in str(raised.value)
-
-
-def test_formats_that_name_their_device_are_formats_and_classes():
-    named = {name: sensor_of_format(name) for name in FORMATS if sensor_of_format(name)}
-    assert named["azure_kinect"] == "azure_kinect" and set(named.values()) <= set(SENSORS) and len(named) == 5
-    assert sensor_of_format("tum") is None

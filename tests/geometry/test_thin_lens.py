@@ -66,18 +66,6 @@ def test_no_spot_beyond_the_focus_is_larger_than_infinitys():
     assert depth_of_spot(exact, torch.tensor([[1.0]]), torch.tensor([2.0])).isnan().all()
 
 
-def test_no_depth_has_no_spot_and_spoils_no_gradient():
-    depth = torch.tensor([[0.0, -1.0, 1.0]] * 2, dtype=torch.float64, requires_grad=True)
-    focus = torch.tensor(FOCUS, dtype=torch.float64)
-    spot = spot_diameter(lens(), depth, focus)
-    assert spot.isnan().tolist() == [[True, True, False]] * 2
-    spot[:, 2].sum().backward()
-    assert depth.grad[:, :2].tolist() == [[0.0, 0.0]] * 2
-    huge = torch.full((2, 2), 1e9, dtype=torch.float64, requires_grad=True)
-    depth_of_spot(lens(), huge * torch.tensor([1.0, -1e-9], dtype=torch.float64), focus)[:, 1].sum().backward()
-    assert huge.grad.isfinite().all()
-
-
 def test_a_disc_spreads_as_a_gaussian_of_a_quarter_of_its_diameter():
     x = np.linspace(-0.5, 0.5, 2001)
     chord = 2 * np.sqrt(0.25 - x**2)
