@@ -23,7 +23,6 @@ PACKAGES = (
     "dhtorch.alignment",
     "dhtorch.validation",
     "dhtorch.metrics",
-    "dhtorch.losses",
     "dhtorch.functional",
     "dhtorch.export",
 )

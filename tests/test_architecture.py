@@ -22,7 +22,7 @@ FLOORS = (
     {"transforms", "measure"},
     {"validation", "integrate", "synthetic"},
     {"pipeline", "functional"},
-    {"stages", "alignment", "metrics", "losses", "export", "data"},
+    {"stages", "alignment", "metrics", "export", "data"},
     {"viz"},
     {"records"},
     {"geometry"},

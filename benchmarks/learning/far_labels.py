@@ -33,7 +33,7 @@ from dhtorch import AUTO, MAP, Method, data, merge
 from dhtorch.codes import Source
 from dhtorch.data.pairs import CANDIDATE_STEPS
 from dhtorch.data.scene import Scene
-from dhtorch.losses import sigma_weighted_depth_loss
+from dhtorch.functional import sigma_weighted_depth_loss
 from dhtorch.metrics import bootstrap, holdout
 from dhtorch.pytree import Record, collate, record
 from dhtorch.records import Frame

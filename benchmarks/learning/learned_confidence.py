@@ -32,7 +32,7 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import protocol
 from dhtorch.experiments.probes.learned_score import LabelledAnswers, label_answers, train_score
-from dhtorch.losses import risk_coverage_loss
+from dhtorch.functional import risk_coverage_loss
 from dhtorch.metrics import bootstrap, risk
 from dhtorch.pytree import collate
 from dhtorch.runtime import storage

@@ -27,10 +27,10 @@ from torch import Tensor
 from dhtorch import MAP, data
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
+from dhtorch.functional import reprojection_loss, sigma_weighted_depth_loss
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.filters import gaussian_blur
-from dhtorch.losses import reprojection_loss, sigma_weighted_depth_loss
 from dhtorch.pytree import collate
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime import storage

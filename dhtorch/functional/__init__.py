@@ -1,5 +1,6 @@
-"""Triangulation, tracking and pose in kornia's conventions, and depth as a picture or as points: plain tensors."""
+"""Triangulation, tracking and pose in kornia's conventions, depth as an image or points, and losses: plain tensors."""
 
+from dhtorch.functional.losses import reprojection_loss, risk_coverage_loss, sigma_weighted_depth_loss
 from dhtorch.functional.points import (
     PnPSolution,
     PointTracks,
@@ -17,6 +18,9 @@ __all__ = [
     "decode_geometry_image",
     "geometry_image",
     "point_cloud",
+    "reprojection_loss",
+    "risk_coverage_loss",
+    "sigma_weighted_depth_loss",
     "solve_p3p",
     "solve_pnp_ransac",
     "track_points_lk",

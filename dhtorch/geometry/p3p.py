@@ -52,7 +52,7 @@ def p3p(
     Gradient: none (choosing among roots); refine the pose instead. Ranges are solved in float64.
     Source: the pencil of conics of M. Persson, K. Nordberg, "Lambda Twist" (ECCV 2018), with another way to find the
     degenerate member; its planes as in J. Richter-Gebert, "Perspectives on Projective Geometry" (2011). Checked
-    against synthetic truth and ``poselib.p3p`` (``tests/geometry/test_p3p.py``).
+    against synthetic truth and ``poselib.p3p`` (``tests/functional/test_points.py``).
 
     Example:
         >>> import torch

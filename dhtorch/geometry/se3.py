@@ -116,7 +116,7 @@ def exp(xi: Tensor) -> Pose:
     """Exponential map: Pose of tangents (B, 6), rotation vector (rad) then translation part (m).
 
     Closed form with series below 0.1 rad, so that value and gradient are exact at zero as well. Equal to
-    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/geometry/test_se3.py``).
+    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/geometry/test_kornia.py``).
     """
     check("se3.exp", xi=(xi, "B 6"))
     omega, upsilon = xi[..., :3], xi[..., 3:]

@@ -41,14 +41,6 @@ def test_decoding_is_within_half_a_code(batch):
     assert ratio.max() < math.log(1.014)
 
 
-def test_a_batch_is_its_pictures_one_by_one():
-    depth, sigma, source = maps(3)
-    one_by_one = torch.stack([fn.geometry_image(*each) for each in zip(depth, sigma, source, strict=True)])
-    assert torch.equal(fn.geometry_image(depth, sigma, source), one_by_one)
-    clouds = torch.stack([fn.point_cloud(each, K, n=50) for each in depth])
-    assert torch.equal(fn.point_cloud(depth, K, n=50), clouds)
-
-
 def test_pixels_without_depth_are_black_and_ranges_end_at_the_last_codes():
     depth = torch.tensor([[0.0, math.nan, math.inf, -1.0, 1.0, 0.01, 1e6, 2.0, 2.0]])
     sigma = torch.tensor([[0.0, 1.0, 1.0, 1.0, 0.1, 1.0, 1.0, 0.0, math.nan]])

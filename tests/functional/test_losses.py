@@ -1,4 +1,5 @@
-"""Losses: values of plain formulas, gradients by gradcheck, and exact zeros where an element does not count."""
+"""Losses: values of plain formulas, gradients by gradcheck, and exact zeros where an element does not count; soft ranks
+against the area of the metrics."""
 
 import math
 
@@ -6,10 +7,11 @@ import pytest
 import torch
 
 from dhtorch import MAP
+from dhtorch.functional import reprojection_loss, risk_coverage_loss, sigma_weighted_depth_loss
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.losses import reprojection_loss, sigma_weighted_depth_loss
 from dhtorch.metrics import holdout
+from dhtorch.metrics.risk import risk_curve
 from dhtorch.records import Camera, Pose
 from dhtorch.synthetic import SyntheticRoom
 
@@ -60,14 +62,6 @@ def test_depth_loss_is_the_mean_cost_of_residuals_over_sigma(kernel, rho):
 
 
 REDUCTIONS = ("none", "sum", "mean")
-
-
-def test_labels_count_with_their_inverse_variance():
-    """The prediction of least loss is the mean of the labels weighted by 1 / sigma²."""
-    t, sigma = torch.tensor([2.0, 3.0], dtype=D), torch.tensor([0.1, 0.3], dtype=D)
-    p = torch.tensor((2 / 0.01 + 3 / 0.09) / (1 / 0.01 + 1 / 0.09), dtype=D, requires_grad=True)
-    sigma_weighted_depth_loss(p.expand(2), t, sigma).backward()
-    assert abs(float(p.grad)) < 1e-9
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -206,3 +200,58 @@ def test_losses_of_an_estimate_as_it_comes():
     )
     loss.backward()
     assert loss.isfinite() and log_focal.grad.isfinite().all() and log_focal.grad.ne(0).all()
+
+
+# --- risk and coverage ---
+
+
+def answers(n=60, sets=3):
+    g = torch.Generator().manual_seed(5)
+    return (torch.rand(sets, n, generator=g, dtype=torch.float64) for _ in range(2))
+
+
+def test_hard_ranks_give_the_area_of_the_metrics():
+    confidence, error = answers()
+    area = torch.stack([risk_curve(e, c).mean() for c, e in zip(confidence, error, strict=True)])
+    torch.testing.assert_close(risk_coverage_loss(confidence, error, temperature=1e-7), area)
+
+
+def test_answers_that_do_not_count_change_nothing_and_get_no_gradient():
+    confidence, error = answers()
+    keep = torch.arange(60) < 40
+    padded_c, padded_e = (torch.where(keep, x, float("nan")).requires_grad_() for x in (confidence, error))
+    loss = risk_coverage_loss(padded_c, padded_e, keep.expand(3, -1))
+    assert risk_coverage_loss(confidence, error, (keep & ~keep).expand(3, -1)).eq(0).all()
+    torch.testing.assert_close(loss, risk_coverage_loss(confidence[:, :40], error[:, :40]))
+    loss.sum().backward()
+    for x in (padded_c, padded_e):
+        assert x.grad.isfinite().all() and (x.grad[:, 40:] == 0).all() and (x.grad[:, :40] != 0).all()
+
+
+def test_an_error_above_1_counts_as_1_and_has_no_gradient():
+    confidence, error = answers()
+    error = (3 * error).requires_grad_()
+    loss = risk_coverage_loss(confidence, error)
+    torch.testing.assert_close(loss, risk_coverage_loss(confidence, error.clamp(max=1)))
+    loss.sum().backward()
+    assert torch.equal(error.grad > 0, error < 1)
+
+
+def test_minimising_it_orders_answers_by_error():
+    """From equal confidences: descent reaches the area of the best order, which is below half of where it began."""
+    _, error = answers(n=40, sets=1)
+    error = error**4
+    confidence = torch.zeros_like(error).requires_grad_()
+    optimiser = torch.optim.Adam([confidence], lr=0.05)
+    for _ in range(200):
+        optimiser.zero_grad()
+        risk_coverage_loss(confidence, error).sum().backward()
+        optimiser.step()
+    reached, best = (float(risk_curve(error[0], c).mean()) for c in (confidence.detach()[0], -error[0]))
+    assert reached < 1.01 * best < 0.5 * float(error.mean())
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
+def test_a_temperature_is_positive(temperature):
+    with pytest.raises(ValueError, match="temperature is"):
+        risk_coverage_loss(*answers(), temperature=temperature)
