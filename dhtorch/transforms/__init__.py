@@ -12,14 +12,15 @@ from dhtorch.transforms.adapters import (
     NumpyTransform,
     RldsBatchTransform,
     collate_kept,
+    declared_depth_range,
+    declared_depth_unit,
     one_thread,
 )
-from dhtorch.transforms.declared_unit import declared_depth_range, declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.maps import DenseMaps
 from dhtorch.transforms.sample_access import SampleError
 from dhtorch.transforms.sample_spec import SampleSpec
-from dhtorch.transforms.status import SampleProblem
+from dhtorch.transforms.schema import SampleProblem
 from dhtorch.transforms.tokens import TOKEN_CHANNELS, patch_tokens, token_grid
 from dhtorch.transforms.validate_depth import ValidateDepth
 

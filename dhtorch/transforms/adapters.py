@@ -11,26 +11,26 @@ directly, before any crop: a crop would not adapt the intrinsics. kornia's conta
 from __future__ import annotations
 
 import copy
+import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import Dataset, IterableDataset, default_collate
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
 
+from dhtorch.data.depth_codes import find_return_range
 from dhtorch.runtime.allocator import disable_malloc_trim
-from dhtorch.transforms import layout
-from dhtorch.transforms.collate import collate_shared, pack_shared
-from dhtorch.transforms.declared_unit import declared_depth_range, declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
+from dhtorch.transforms.layout import UNREADABLE_KEY, conform, explain_difference, zeros_like
 from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
-from dhtorch.transforms.sample_spec import AUTO_UNIT, NO_LIMITS
-from dhtorch.transforms.validate_depth import ValidateDepth
-
-#: Number of items, first ones and neighbours each, that are tried for the shapes of one that cannot be loaded.
-_MAX_ITEMS_TRIED = 16
+from dhtorch.transforms.sample_spec import AUTO_UNIT, NO_LIMITS, SampleSpec
 
 
 class _DatasetWrapper:
@@ -97,12 +97,9 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         self.by_batch, self.consumed = by_batch, tuple(consumed)
         self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
         views = transform.views
-        self._gap_keys: tuple[str, ...] = (
-            f"{views.other_image}",
-            f"{views.other_image}_is_pad",
-        )  # keys added by a gap while the transform runs
-        if views.pose is not None and views.other_pose is not None:
-            self._gap_keys += (views.other_pose,)
+        # Keys added by a gap while the transform runs.
+        other_pose = () if views.pose is None or views.other_pose is None else (views.other_pose,)
+        self._gap_keys = (f"{views.other_image}", f"{views.other_image}_is_pad", *other_pose)
         # Zeros in the shapes of the first good item; empty = there is none, None = not looked for.
         self._layout: dict[str, Any] | None = None
 
@@ -122,8 +119,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
             return self._left_out(dict(blank), f"item {i} cannot be loaded: {error}")
         if self.transform.on_error == "flag":
             like, keys = self._find_layout(i), (*self.transform.read_keys, *self._gap_keys)
-            if difference := layout.explain_difference(sample, like, keys):
-                return self._left_out(layout.conform(sample, like, keys), f"item {i}: {difference}")
+            if difference := explain_difference(sample, like, keys):
+                return self._left_out(conform(sample, like, keys), f"item {i}: {difference}")
         if self.by_batch:
             return self._marked(sample, False)
         return self._drop_internal(self.transform(sample))
@@ -137,7 +134,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
 
     def _marked(self, sample: dict[str, Any], is_unreadable: bool) -> dict[str, Any]:
         """Item with the mark of those not read, where the transform flags them."""
-        return sample if self.transform.on_error == "raise" else {**sample, layout.UNREADABLE_KEY: is_unreadable}
+        return sample if self.transform.on_error == "raise" else {**sample, UNREADABLE_KEY: is_unreadable}
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
         """Samples -> batch by torch's default collate, with ``by_batch`` then transformed as a whole.
@@ -147,24 +144,26 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         """
         if not self.by_batch:
             skips = self.transform.on_error == "skip"
-            return (collate_kept if skips else collate_shared)(samples, self.transform.prefix)
-        return pack_shared(self._transform_batch(samples), self.transform.prefix)
-
-    def _transform_batch(self, samples: Sequence[Any]) -> dict[str, Any]:
-        """Samples not yet transformed -> transformed batch."""
+            return (collate_kept if skips else _collate_shared)(samples, self.transform.prefix)
         # In a worker torch collates into new shared memory, which is several times slower: consumed keys avoid that.
-        consumed = {key: _collect_key(samples, key) for key in self.consumed if has_key(samples[0], key)}
+        consumed = {
+            key: [to_tensor(get_value(sample, key), key, signed=False) for sample in samples]
+            for key in self.consumed
+            if has_key(samples[0], key)
+        }
         views = self.transform.views
         stacked = {key: torch.stack(values) for key, values in consumed.items() if key != views.depth}
         if views.depth in consumed:
             stacked[views.metric_depth_key] = views.metres(consumed[views.depth])
         batch = default_collate([drop_keys(sample, consumed) for sample in samples] if consumed else list(samples))
-        return self._drop_internal(self.transform({**batch, **stacked} if stacked else batch)) or {}
+        out = self._drop_internal(self.transform({**batch, **stacked} if stacked else batch)) or {}
+        shareable = _shareable_tensors(out, self.transform.prefix)
+        return {**out, **{key: place.copy_(shareable[key]) for key, place in _allocate_shared(shareable).items()}}
 
     def _drop_internal(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Drop the keys that a gap added, and the consumed keys."""
         dropped = (*self.consumed, self.transform.views.metric_depth_key) if self.consumed else ()
-        dropped = (*dropped, layout.UNREADABLE_KEY) if self.by_batch and self.transform.on_error == "flag" else dropped
+        dropped = (*dropped, UNREADABLE_KEY) if self.by_batch and self.transform.on_error == "flag" else dropped
         dropped = dropped if self.gap is None else (*dropped, *self._gap_keys)
         return drop_keys(out, dropped) if out is not None and dropped else out
 
@@ -173,52 +172,40 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         sample = self.dataset[i]
         if not isinstance(sample, Mapping) and self.transform.on_error == "flag":
             raise SampleError(f"found {type(sample).__name__}, expected a dict with pictures and depth")
+        views = self.transform.views
         if self.gap is None:
-            self._require_source_view(sample)
+            other = views.other_image  # which a ``gap`` would add
+            if isinstance(other, str) and not has_key(sample, other):
+                expected = "gap=N, the items from the source view to the reference view, or that key in the items"
+                raise SampleError(f"{other}: found no such key and no gap, expected {expected}")
             return sample
         earlier = self.dataset[i - self.gap] if i >= self.gap else sample
-        same = i >= self.gap and self._episode(earlier) == self._episode(sample)
-        views, source = self.transform.views, earlier if same else sample
+        key = self.episode_key
+        same = i >= self.gap and (key is None or int(get_value(earlier, key)) == int(get_value(sample, key)))
+        source = earlier if same else sample
         values = [get_value(source, views.image), torch.tensor([not same])]
         if len(self._gap_keys) > len(values):
             values.append(get_value(source, str(views.pose)))
         return {**sample, **dict(zip(self._gap_keys, values, strict=True))}
-
-    def _require_source_view(self, sample: Mapping[str, Any]) -> None:
-        """Raise SampleError for an item without the source view, which a ``gap`` would add."""
-        other = self.transform.views.other_image
-        if isinstance(other, str) and not has_key(sample, other):
-            expected = "gap=N, the items from the source view to the reference view, or that key in the items"
-            raise SampleError(f"{other}: found no such key and no gap, expected {expected}")
 
     def __repr__(self) -> str:
         gap = "the source view in each item" if self.gap is None else f"the source view {self.gap} items before"
         gap = gap if self.transform.views.other_image is not None else "no source view"
         return f"ExtendedDataset({len(self)} items of {type(self.dataset).__name__}, {gap}, {self.transform!r})"
 
-    def _episode(self, sample: Mapping[str, Any]) -> int:
-        return 0 if self.episode_key is None else int(get_value(sample, self.episode_key))
-
     def _find_layout(self, i: int) -> dict[str, Any]:
         """Zeros in the shapes of the first item that can be read; of item ``i`` or its neighbours where the first
-        cannot; empty where none of them can.
+        cannot; empty where none of them can. Of either 16 at most are tried.
         """
         if self._layout is None:
-            near = [i, *(i + sign * step for step in range(1, _MAX_ITEMS_TRIED) for sign in (1, -1))]
-            places = dict.fromkeys([*range(_MAX_ITEMS_TRIED), *near])
-            readable = (sample for k in places if (sample := self._load_readable(k)) is not None)
-            self._layout = layout.zeros_like(next(readable, {}))
+            self._layout = {}
+            near = [i, *(i + sign * step for step in range(1, 16) for sign in (1, -1))]
+            for k in dict.fromkeys([*range(16), *near]):
+                with suppress(Exception):  # corrupt as well
+                    if 0 <= k < len(self) and not bool(self.transform.views.read(sample := self._load(k)).bad.any()):
+                        self._layout = zeros_like(sample)
+                        break
         return self._layout
-
-    def _load_readable(self, k: int) -> dict[str, Any] | None:
-        """Item ``k``, None where there is none that the transform can read."""
-        if not 0 <= k < len(self):
-            return None
-        try:
-            sample = self._load(k)
-            return None if bool(self.transform.views.read(sample).bad.any()) else sample
-        except Exception:
-            return None  # corrupt as well
 
 
 class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
@@ -226,7 +213,7 @@ class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
         self.dataset = dataset
-        reads_depth = isinstance(transform, ExtendDepth | ValidateDepth)
+        reads_depth = isinstance(getattr(transform, "views", None), SampleSpec)
         self.transform = _as_declared(transform, dataset) if reads_depth else transform
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
@@ -274,7 +261,7 @@ class AddedCollate:
     def __call__(self, instances: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Samples -> batch."""
         added = [{k: v for k, v in sample.items() if k.startswith(self.prefix)} for sample in instances]
-        return {**self.collate(instances), **collate_shared(added, self.prefix)}
+        return {**self.collate(instances), **_collate_shared(added, self.prefix)}
 
 
 def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorch.") -> dict[str, Any]:
@@ -285,7 +272,7 @@ def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorc
     """
     kept = [sample for sample in samples if sample is not None]
     skipped = torch.tensor(len(samples) - len(kept))
-    return {**(collate_shared(kept, prefix) if kept else {}), "dhtorch.skipped": skipped}
+    return {**(_collate_shared(kept, prefix) if kept else {}), "dhtorch.skipped": skipped}
 
 
 def one_thread(worker: int = 0) -> None:
@@ -299,6 +286,104 @@ def one_thread(worker: int = 0) -> None:
     opencv = sys.modules.get("cv2")
     if opencv is not None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which do not exist in a forked worker
+
+
+# ----------------------------------------------------------------------- one block of shared memory for what is added
+#
+# Otherwise each tensor that a worker returns is a shared-memory file of its own, whose handle the main process requests
+# from the worker while that computes its next batch: seventeen times a batch, whatever their size. The keys are views
+# of the block: keeping one of them keeps all.
+
+
+def _collate_shared(samples: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, Any]:
+    """Samples -> batch by torch's default collate; in a worker tensors under keys with ``prefix`` share one block.
+
+    Raises RuntimeError if the shapes of samples differ, KeyError if a sample lacks a key, as the default collate does.
+    """
+    shareable = _shareable_tensors(samples[0], prefix)
+    if not shareable:
+        return default_collate(list(samples))
+    batch = default_collate([{k: v for k, v in sample.items() if k not in shareable} for sample in samples])
+    for key, place in _allocate_shared(shareable, len(samples)).items():
+        batch[key] = torch.stack([sample[key] for sample in samples], out=place)
+    return batch
+
+
+def _shareable_tensors(batch: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+    """Dense CPU tensors under keys with ``prefix``, in a worker; none outside a worker."""
+    if get_worker_info() is None:
+        return {}
+    tensors = {key: x for key, x in batch.items() if key.startswith(prefix) and type(x) is Tensor}
+    return {key: x for key, x in tensors.items() if x.is_cpu and x.layout == torch.strided}
+
+
+def _allocate_shared(like: Mapping[str, Tensor], *front: int) -> dict[str, Tensor]:
+    """Tensors -> empty tensors of shape (``front``, …) and the same dtypes, consecutive in one shared block."""
+    shapes = {key: (*front, *x.shape) for key, x in like.items()}
+    sizes = [math.prod(shapes[key]) * x.element_size() for key, x in like.items()]
+    # Aligned to 64 bytes: vector registers and cache lines.
+    starts = list(accumulate((size + -size % 64 for size in sizes), initial=0))
+    block = torch.empty(starts[-1], dtype=torch.uint8, device="cpu").share_memory_()
+    rows = zip(like.items(), starts[:-1], sizes, strict=True)
+    return {key: block[at : at + size].view(x.dtype).view(shapes[key]) for (key, x), at, size in rows}
+
+
+# --------------------------------------------------------------- unit and range of depth, as LeRobot data sets declare
+
+#: Unit of a decoded depth video -> largest error of its rounding, m. Source: derived: LeRobot 0.6 rounds to whole
+#: millimetres and not at all in metres; a hundredth of a millimetre for its arithmetic in float32.
+_ROUNDING_M = {"m": 0.0, "mm": 0.51e-3}
+
+
+def declared_depth_unit(dataset: Any, key: str) -> str:
+    """LeRobot data set and key of its depth -> unit of the depth in its items, ``m`` or ``mm``.
+
+    LeRobot 0.6 and later convert depth that is an image with a stated ``depth_unit``, or a video, into the data set's
+    ``depth_output_unit``; earlier versions hand out what is stored, and all of them arrays of numbers.
+
+    Raises:
+        ValueError: a data set that declares none: nothing is inferred from the numbers.
+    """
+    features = getattr(getattr(dataset, "meta", None), "features", None)
+    if not isinstance(features, Mapping):
+        raise ValueError(f"depth_unit=auto: found {type(dataset).__name__}, expected a LeRobot data set; else m or mm")
+    if key not in features:
+        raise ValueError(f"depth_unit=auto: found no feature {key}, expected one of {', '.join(features)}")
+    feature = features[key]
+    info = feature.get("info") or {}
+    stored = info.get("depth_unit")
+    if feature["dtype"] in ("image", "video") and (converts := _output_unit(dataset, key)):
+        unit = converts if feature["dtype"] == "video" or stored is not None else None
+    else:
+        unit = None if feature["dtype"] == "video" else stored or info.get("unit")
+    if unit not in ("m", "mm"):
+        feature_text = f"{key} ({feature['dtype']}) without a unit that this LeRobot declares"
+        expected = "depth_unit in its info; else depth_unit='m' or 'mm'"
+        raise ValueError(f"depth_unit=auto: found {feature_text}, expected {expected}")
+    return str(unit)
+
+
+def declared_depth_range(dataset: Any, key: str) -> tuple[float, float]:
+    """LeRobot data set and key of its depth -> lower and upper limit in m of returns, for ``depth_range``.
+
+    A depth video has no code for *no return*: LeRobot hands out its two ends, ``depth_min`` and ``depth_max``, instead.
+    Depth in another form, of other data sets or of versions that decode no depth has no limits, (0, inf).
+
+    Raises:
+        FormatError: the data set states an invalid range.
+    """
+    features = getattr(getattr(dataset, "meta", None), "features", None)
+    feature = features.get(key) if isinstance(features, Mapping) else None
+    unit = _output_unit(dataset, key) if feature is not None and feature["dtype"] == "video" else None
+    if feature is None or unit is None:
+        return NO_LIMITS
+    return find_return_range(feature.get("info") or {}, key, Path("meta") / "info.json", _ROUNDING_M[unit])
+
+
+def _output_unit(dataset: Any, key: str) -> str | None:
+    """Unit into which LeRobot converts a depth image or video; None if it is not marked as depth, and before 0.6."""
+    unit = getattr(dataset, "depth_output_unit", None)
+    return unit if unit in _ROUNDING_M and key in (getattr(dataset.meta, "depth_keys", None) or ()) else None
 
 
 def _as_declared(transform: Any, dataset: Any) -> Any:
@@ -315,8 +400,3 @@ def _as_declared(transform: Any, dataset: Any) -> Any:
     other = copy.copy(transform)
     other.views = replace(views, **changes)
     return other
-
-
-def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
-    """Values of a key in all samples, as tensors."""
-    return [to_tensor(get_value(sample, key), key, signed=False) for sample in samples]

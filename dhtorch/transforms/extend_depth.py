@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
-from dhtorch.codes import Gate
+from dhtorch.codes import Gate, names
 from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
@@ -19,13 +19,39 @@ from dhtorch.pipeline.presets import get_method
 from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.runtime.numerics import standard_numerics
-from dhtorch.transforms import layout, maps, poses, schema
+from dhtorch.transforms.layout import UNREADABLE_KEY, clear_non_finite, conform, zeros_like
+from dhtorch.transforms.maps import DenseMaps, map_to_samples
+from dhtorch.transforms.poses import pose_label, warn_refuted_poses
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, has_key, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews, default_prefix
-from dhtorch.transforms.status import ProblemCounts, SampleProblem
+from dhtorch.transforms.schema import SampleProblem, SampleResults, blank_columns, columns_of_options
 from dhtorch.transforms.tokens import FIT_MODES, patch_tokens, token_grid
 
 ON_ERROR_CHOICES = ("raise", "skip", "flag")
+
+#: Rows of the table of counts; more workers than rows share a row, and may then lose counts.
+_MAX_COUNT_ROWS = 128
+
+
+class _ProblemCounts:
+    """Counts by problem in memory shared with forked and spawned workers, each of which writes its own row."""
+
+    def __init__(self) -> None:
+        counts = torch.zeros(_MAX_COUNT_ROWS, len(names(SampleProblem)), dtype=torch.int64, device="cpu")
+        self.counts = counts.share_memory_()
+
+    def add(self, problem: Tensor) -> None:
+        """Count problem codes (B,) of samples."""
+        worker = get_worker_info()
+        row = 0 if worker is None else 1 + worker.id % (_MAX_COUNT_ROWS - 1)
+        counts = self.counts[row].numpy()  # numpy: several torch operations per sample cost more
+        for number in problem.tolist():
+            counts[number] += 1
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _ProblemCounts:
+        clone = copy.copy(self)
+        clone.counts = self.counts.clone().share_memory_()
+        return clone
 
 
 class ExtendDepth(torch.nn.Module):
@@ -111,7 +137,7 @@ class ExtendDepth(torch.nn.Module):
             raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FIT_MODES)}")
         token_grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises if no patch fits
         self.views = SampleSpec(**views)
-        self.maps = maps.DenseMaps.from_options(dense)
+        self.maps = DenseMaps.from_options(dense)
         self.budget = budget and self.maps is not None
         self.method, self.hint = method, hint
         self.learned = torch.nn.ModuleList(iter_networks(self.method))  # so that .to() and .parameters() find them
@@ -120,7 +146,7 @@ class ExtendDepth(torch.nn.Module):
         self.on_error, self.batched = on_error, bool(batched)
         self.prefix = default_prefix(self.views.image) if prefix is None else prefix
         self._batched_option = batched
-        self.tally = ProblemCounts()
+        self.tally = _ProblemCounts()
         self._seen_hw: tuple[int, int] | None = None
         self._layout: dict[str, Any] | None = None  # zeros in the shapes of the first good sample, with on_error=flag
 
@@ -145,7 +171,10 @@ class ExtendDepth(torch.nn.Module):
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """Sample or batch -> copy of it with the added columns; None if it is skipped."""
         if torch.compiler.is_compiling():
-            return _run_uncompiled(ExtendDepth._extend)(self, sample)
+            return torch.compiler.disable(
+                ExtendDepth._extend,
+                reason="ExtendDepth reads a sample in Python, and its control flow depends on values",
+            )(self, sample)
         return self._extend(sample)
 
     def _extend(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -154,7 +183,11 @@ class ExtendDepth(torch.nn.Module):
         check_sample(sample, self.views.image, self.views.intrinsics, self._batched_option)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
-                read = _with_marks(self.views.read(sample, batched=self.batched), sample)
+                read = self.views.read(sample, batched=self.batched)
+                if UNREADABLE_KEY in sample:  # bad too; their messages were shown when they were loaded
+                    marked = to_tensor(sample[UNREADABLE_KEY], UNREADABLE_KEY).to(read.bad)
+                    complaints = ((marked, marked.float(), ""), *read.complaints)
+                    read = read._replace(bad=read.bad | marked, complaints=complaints)
                 seed = self._seeds(sample, len(read.bad))
                 flagged = bool(read.complaints) and bool(read.bad.any())
                 if flagged and not (self.batched and self.on_error == "flag"):
@@ -165,12 +198,51 @@ class ExtendDepth(torch.nn.Module):
                 return self.left_out(sample, error)
             if flagged and (complaint := read.complaint()):
                 warnings.warn(f"flagged: {complaint}", stacklevel=3)
-            added = self._compute_columns(read, seed, flagged)
-        self._count_problems(added["problem"], read.reference.hw)
+            frame, paired = read.reference, read.paired
+            samples, estimate, fits, dense = self._run_method(read, seed)
+            merged = merge(samples, estimate)
+            pooled = (merged, samples.hole) if dense is None else map_to_samples(dense, frame, self.method)
+            tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
+            xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, merged.uv, merged.depth)
+            # Plain Python, because several torch operations on so few numbers cost more.
+            bad = read.bad.tolist() if flagged else [False] * len(paired)
+            codes = [
+                SampleProblem.UNREADABLE
+                if is_bad
+                else SampleProblem.NO_DEPTH
+                if not has_returns
+                else SampleProblem.NONE
+                if is_paired
+                else SampleProblem.NO_SECOND_VIEW
+                for is_bad, has_returns, is_paired in zip(bad, read.has_returns.tolist(), paired.tolist(), strict=True)
+            ]
+            results = SampleResults(
+                samples=samples,
+                merged=merged,
+                xyz=xyz,
+                estimate=estimate,
+                fits=fits,
+                paired=paired,
+                tokens=tokens,
+                dense=dense,
+                problem=torch.tensor(codes, dtype=torch.int32, device=xyz.device),
+            )
+            columns = {column: column.compute(results) for column in columns_of_options(self._column_options())}
+            added = {column.key: x for column, x in columns.items()}
+            if self.views.pose is not None:
+                warn_refuted_poses(fits, paired, added["pose_convention"], pose_label(self.views.pose))
+            if flagged:
+                added = {
+                    column.key: x.masked_fill(read.bad.view(-1, *[1] * (x.ndim - 1)), column.unreadable)
+                    for column, x in columns.items()
+                }
+        self.tally.add(added["problem"])
+        if self._seen_hw != read.reference.hw:  # nn.Module.__setattr__ is slow
+            self._seen_hw = read.reference.hw
         if flagged:
-            sample = layout.clear_non_finite(sample, self.views.number_keys(), read.bad)
+            sample = clear_non_finite(sample, self.views.number_keys(), read.bad)
         elif self.on_error == "flag" and self._layout is None and not self.batched:
-            self._layout = {k: layout.zeros_like(get_value(sample, k)) for k in self.read_keys if has_key(sample, k)}
+            self._layout = {k: zeros_like(get_value(sample, k)) for k in self.read_keys if has_key(sample, k)}
         return self._add_columns(sample, added)
 
     @property
@@ -180,7 +252,8 @@ class ExtendDepth(torch.nn.Module):
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem since the transform was constructed, summed over all workers."""
-        return self.tally.report()
+        total = self.tally.counts.sum(0).tolist()
+        return {name.lower(): total[code] for code, name in names(SampleProblem).items()}
 
     def left_out(self, sample: Mapping[str, Any], error: Exception) -> dict[str, Any] | None:
         """Result for an unreadable sample by ``on_error``: None, or the sample with blank columns; counts and warns.
@@ -189,8 +262,8 @@ class ExtendDepth(torch.nn.Module):
             SampleError: ``on_error`` is flag, and the image size is unknown.
         """
         if self.on_error == "flag":
-            sample = layout.clear_non_finite(sample, self.views.number_keys())
-            sample = sample if self._layout is None else layout.conform(sample, self._layout, self.read_keys)
+            sample = clear_non_finite(sample, self.views.number_keys())
+            sample = sample if self._layout is None else conform(sample, self._layout, self.read_keys)
         hw = (None if self.maps else self.tokens_hw) or self.views.image_hw(sample) or self._seen_hw
         if self.on_error == "flag" and hw is None:
             missing = "maps" if self.maps else "tokens: give tokens_hw"
@@ -198,32 +271,6 @@ class ExtendDepth(torch.nn.Module):
         warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=4)
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._add_columns(sample, self.blank_columns(hw))
-
-    def _compute_columns(self, read: SampleViews, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
-        """Views of B samples -> added columns (B, …), unreadable samples blanked where ``flagged``."""
-        frame, paired, bad = read.reference, read.paired, read.bad
-        samples, estimate, fits, dense = self._run_method(read, seed)
-        merged = merge(samples, estimate)
-        pooled = (merged, samples.hole) if dense is None else maps.map_to_samples(dense, frame, self.method)
-        tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
-        xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, merged.uv, merged.depth)
-        problem = torch.tensor(_problem_codes(read, flagged), dtype=torch.int32, device=xyz.device)
-        results = schema.SampleResults(
-            samples=samples,
-            merged=merged,
-            xyz=xyz,
-            estimate=estimate,
-            fits=fits,
-            paired=paired,
-            tokens=tokens,
-            dense=dense,
-            problem=problem,
-        )
-        added = schema.compute_columns(results, self._column_options())
-        if self.views.pose is not None:
-            label = poses.pose_label(self.views.pose)
-            poses.warn_refuted_poses(fits, paired, added["pose_convention"], label)
-        return schema.fill_unreadable(added, bad) if flagged else added
 
     def _run_method(
         self, read: SampleViews, seed: int | Tensor
@@ -266,53 +313,15 @@ class ExtendDepth(torch.nn.Module):
         sizes = {"N": self.method.n, "P": rows * columns}
         if self.maps is not None:
             sizes |= dict(zip("HW", self.maps.hw(hw), strict=True))
-        return schema.blank_columns(sizes, self._column_options())
+        return blank_columns(sizes, self._column_options())
 
     def _column_options(self) -> list[str]:
         """The active options that add columns, see :mod:`dhtorch.transforms.schema`."""
         active = {"pose": self.views.pose is not None, "dense": self.maps is not None, "budget": self.budget}
         return [option for option, is_active in active.items() if is_active]
 
-    def _count_problems(self, problem: Tensor, hw: tuple[int, int]) -> None:
-        """Add the problem codes (B,) to the tally and remember the image size for blank columns."""
-        self.tally.add(problem)
-        if self._seen_hw != hw:  # nn.Module.__setattr__ is slow
-            self._seen_hw = hw
-
     def _add_columns(self, sample: Mapping[str, Any], added: Mapping[str, Tensor]) -> dict[str, Any]:
         """Sample and columns (B, …) -> new dict with the columns under prefixed keys."""
         # Contiguous copies: a row of a shared table would be sent to the main process with the whole table.
         prefixed = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
         return {**sample, **prefixed}
-
-
-def _run_uncompiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as ``torch.compile`` calls it without tracing into it."""
-    return torch.compiler.disable(
-        function, reason="ExtendDepth reads a sample in Python, and its control flow depends on values"
-    )
-
-
-def _with_marks(read: SampleViews, batch: Mapping[str, Any]) -> SampleViews:
-    """Views of a batch, bad also where its items are marked as not read; their messages were shown before."""
-    if layout.UNREADABLE_KEY not in batch:
-        return read
-    marked = to_tensor(batch[layout.UNREADABLE_KEY], layout.UNREADABLE_KEY).to(read.bad)
-    if not bool(marked.any()):
-        return read
-    complaint = (marked, marked.float(), "")
-    return read._replace(bad=read.bad | marked, complaints=(complaint, *read.complaints))
-
-
-def _problem_codes(read: SampleViews, flagged: bool) -> list[int]:
-    """Problem code of each sample; plain Python, because several torch operations on so few numbers cost more."""
-    bad = read.bad.tolist() if flagged else [False] * len(read.bad)
-
-    def code(bad: bool, has_returns: bool, paired: bool) -> int:
-        if bad:
-            return SampleProblem.UNREADABLE
-        if not has_returns:
-            return SampleProblem.NO_DEPTH
-        return SampleProblem.NONE if paired else SampleProblem.NO_SECOND_VIEW
-
-    return list(map(code, bad, read.has_returns.tolist(), read.paired.tolist()))

@@ -52,13 +52,9 @@ PAIR_KEYS = {
     "pose_kind": "1_from_0",
 }
 
-#: Limits shear as |q qᵀ − 1|, and perspective as its share of a pixel's distance from the corner, without unit.
-#: Source: derived, focal lengths written with three digits; rounding of kornia's matrices is far below.
-MAX_SHEAR = 2e-3
-
-#: Added to the position of a map's pixel before it is rounded, px: halves round alike whatever the rounding of A.
-#: Source: derived, 100 times single precision at 1000 px.
-TIE_PX = 1e-2
+#: Limits shear as |q qᵀ − 1|, and perspective as a fraction of a pixel's distance from the corner, without unit: focal
+#: lengths are written with three digits; rounding of kornia's matrices is far below.
+_MAX_SHEAR = 2e-3
 
 #: What a camera without skew sees as another camera: for messages.
 _MOVES = "flips, crops, resizes, and rotations of square pixels"
@@ -113,7 +109,16 @@ class AugmentSample(torch.nn.Module):
             raise ValueError("AugmentSample: found no views, expected the options of SampleSpec, or ExtendDepth inside")
         self.views = SampleSpec(**views) if views else inside[0].views
         self.batched = bool(inside[0].batched if batched is None and inside else batched)
-        _check_keys(self.views)
+        for name in ("intrinsics", "distortion", "depth_intrinsics", "other_intrinsics", "pose"):
+            value = getattr(self.views, name)
+            if value is not None and not isinstance(value, str):
+                raise ValueError(
+                    f"{name}: found numbers, expected a key of the sample, whose values move with its pictures"
+                )
+        if self.views.intrinsics_hw is not None:
+            raise ValueError(
+                "intrinsics_hw: found a size, expected None: moved intrinsics belong to the augmented pictures"
+            )
         self.transform_matrix: Tensor | None = None
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,7 +127,21 @@ class AugmentSample(torch.nn.Module):
         params = self.container.forward_parameters(state.pictures[self.views.image][:, 0].shape)
         self._run(self.container, params, state)
         self.transform_matrix = state.A
-        return self._others(state.write(), params)
+        sample = state.write()
+        # Masks, boxes, keypoints and other images are moved by kornia, with the same parameters.
+        container = self.container
+        if not isinstance(container, AugmentationSequential) or container.data_keys is not None:
+            return sample
+        own = {*self.views.keys(), self.views.metric_depth_key}
+        names = tuple(k for k, x in sample.items() if k not in own and isinstance(x, Tensor | np.ndarray))
+        unknown = container._read_datakeys_from_dict(names)[1] or ()
+        others = {key: to_tensor(sample[key], key) for key in names if key not in unknown}
+        if not others:
+            return sample
+        others = others if self.batched else {key: x[None] for key, x in others.items()}
+        ours = [p for p in params if not isinstance(container.get_submodule(p.name), _SAMPLE_TRANSFORMS)]
+        moved = container(others, params=ours)
+        return sample | (moved if self.batched else {key: x[0] for key, x in moved.items()})
 
     def _run(self, container: ImageSequential, params: list[ParamItem], state: _Augmented) -> None:
         """Run the children of a container that its parameters name, in their order."""
@@ -135,24 +154,6 @@ class AugmentSample(torch.nn.Module):
             else:
                 extra = getattr(container, "extra_args", {}).get(DataKey.INPUT, {})
                 state.apply(module, param, extra)
-
-    def _others(self, sample: dict[str, Any], params: list[ParamItem]) -> dict[str, Any]:
-        """The sample with masks, boxes, keypoints and other pictures moved by kornia, with the same parameters."""
-        container = self.container
-        if not isinstance(container, AugmentationSequential) or container.data_keys is not None:
-            return sample
-        own = {*self.views.keys(), self.views.metric_depth_key}
-        names = tuple(k for k, x in sample.items() if k not in own and isinstance(x, Tensor | np.ndarray))
-        unknown = container._read_datakeys_from_dict(names)[1] or ()
-        others = {key: to_tensor(sample[key], key) for key in names if key not in unknown}
-        if not others:
-            return sample
-        others = others if self.batched else {key: x[None] for key, x in others.items()}
-        moved = container(others, params=[p for p in params if not self._takes_samples(p)])
-        return sample | (moved if self.batched else {key: x[0] for key, x in moved.items()})
-
-    def _takes_samples(self, param: ParamItem) -> bool:
-        return isinstance(self.container.get_submodule(param.name), _SAMPLE_TRANSFORMS)
 
 
 class _Augmented:
@@ -183,7 +184,7 @@ class _Augmented:
         if moves:
             A = torch.as_tensor(module.transform_matrix).to(self.A)
             A = A / A[:, 2:, 2:]
-            if (A[:, 2, :2].abs() * max(self._size()) > MAX_SHEAR).any():
+            if (A[:, 2, :2].abs() * max(self._size()) > _MAX_SHEAR).any():
                 raise SampleError(f"{name}: found a perspective, expected {_MOVES}")
             self.A = torch.cat((A[:, :2], A.new_tensor([0.0, 0, 1]).expand(len(A), 1, 3)), 1) @ self.A
 
@@ -203,9 +204,21 @@ class _Augmented:
         camera = self._camera(views.intrinsics)
         moved, Q = cam.warp(camera, self.A)
         shear = (Q @ Q.mT - torch.eye(3).to(Q)).abs().amax()
-        if shear > MAX_SHEAR:
+        if shear > _MAX_SHEAR:
             raise SampleError(f"augmentation: found a shear, expected {_MOVES}")
-        size, places = self._depth_places(camera, new_hw)
+        # Size of the moved depth map, and the pixels (B, h' w', 2) of the given map under its own
+        h, w = self._reader().planes(self.views.depth, self.T).shape[-2:]
+        depth_camera, gain = None, self.A.new_tensor([w / self.hw[1], h / self.hw[0]])
+        if self.views.depth_intrinsics is not None:
+            if camera.distortion is not None:
+                raise SampleError(f"{self.views.depth_intrinsics}: found a distortion beside it, expected none")
+            depth_camera = self._camera(self.views.depth_intrinsics)
+            gain = (depth_camera.f / camera.f).mean(0)
+        size = (max(round(new_hw[0] * float(gain[1])), 1), max(round(new_hw[1] * float(gain[0])), 1))
+        v, u = torch.meshgrid(*(torch.arange(n).to(self.A) for n in size), indexing="ij")
+        uv = cam.resize_pixels(torch.stack((u, v), -1).flatten(0, 1), size, new_hw)
+        uv = torch.nn.functional.pad(uv, (0, 1), value=1.0) @ torch.linalg.inv(self.A)[:, :2].mT
+        places = cam.depth_pixels(camera, self.hw, depth_camera, (h, w), uv)
         maps = [key for key in (views.depth, views.confidence) if key is not None]
         values |= {key: self._moved_map(key, size, places) for key in maps}
         for key in (views.intrinsics, views.other_intrinsics):
@@ -247,28 +260,14 @@ class _Augmented:
         x = x.movedim(2, -1) if layout == "hwc" else x
         return self._returned(x if stored.ndim == 5 else x[:, 0])
 
-    def _depth_places(self, camera: Camera, new_hw: tuple[int, int]) -> tuple[tuple[int, int], Tensor]:
-        """Size of the moved depth map, and the pixels (B, h' w', 2) of the given map under its own."""
-        h, w = self._reader().planes(self.views.depth, self.T).shape[-2:]
-        depth_camera, gain = None, self.A.new_tensor([w / self.hw[1], h / self.hw[0]])
-        if self.views.depth_intrinsics is not None:
-            if camera.distortion is not None:
-                raise SampleError(f"{self.views.depth_intrinsics}: found a distortion beside it, expected none")
-            depth_camera = self._camera(self.views.depth_intrinsics)
-            gain = (depth_camera.f / camera.f).mean(0)
-        size = (max(round(new_hw[0] * float(gain[1])), 1), max(round(new_hw[1] * float(gain[0])), 1))
-        v, u = torch.meshgrid(*(torch.arange(n).to(self.A) for n in size), indexing="ij")
-        uv = cam.resize_pixels(torch.stack((u, v), -1).flatten(0, 1), size, new_hw)
-        uv = torch.nn.functional.pad(uv, (0, 1), value=1.0) @ torch.linalg.inv(self.A)[:, :2].mT
-        return size, cam.depth_pixels(camera, self.hw, depth_camera, (h, w), uv)
-
     def _moved_map(self, key: str, size: tuple[int, int], places: Tensor) -> Tensor:
         """A depth or confidence map at other places, 0 outside; in the type and layout of the sample."""
         stored = self._stored(key)
         x = self._reader(stored.dtype).planes(key, self.T, signed=False)
         x = x.view(torch.int16) if x.dtype == torch.uint16 else x
         h, w = x.shape[-2:]
-        u, v = (places + 0.5 + TIE_PX).floor().long().unbind(-1)
+        # 1e-2 px, 100 times single precision at 1000 px: halves round alike whatever the rounding of A.
+        u, v = (places + 0.5 + 1e-2).floor().long().unbind(-1)
         inside = ((u >= 0) & (u < w) & (v >= 0) & (v < h))[:, None]
         index = (v.clamp(0, h - 1) * w + u.clamp(0, w - 1))[:, None].expand(-1, x.shape[1], -1)
         values = x.flatten(-2).gather(-1, index)
@@ -397,17 +396,3 @@ def _check_children(module: torch.nn.Module) -> None:
     if not (isinstance(module, (*_SAMPLE_TRANSFORMS, RigidAffineAugmentationBase2D)) or _is_colour(module)):
         expected = "an augmentation that has a transform_matrix or changes colours alone"
         raise ValueError(f"AugmentSample: found {type(module).__name__}, expected {expected}")
-
-
-def _check_keys(views: SampleSpec) -> None:
-    """Raise ValueError for numbers that would move, but are no keys of the sample."""
-    for name in ("intrinsics", "distortion", "depth_intrinsics", "other_intrinsics", "pose"):
-        value = getattr(views, name)
-        if value is not None and not isinstance(value, str):
-            raise ValueError(
-                f"{name}: found numbers, expected a key of the sample, whose values move with its pictures"
-            )
-    if views.intrinsics_hw is not None:
-        raise ValueError(
-            "intrinsics_hw: found a size, expected None: moved intrinsics belong to the augmented pictures"
-        )

@@ -56,19 +56,14 @@ class DenseMaps:
         return dense.sensor_depth_map(reference, method=method, size=self.options["size"])
 
 
-def zero_unanswered(depth_map: DepthMap, values: Tensor) -> Tensor:
-    """Values (B, h, w) of a map -> the same with 0 where it has no depth. Gradient: to the values."""
-    return torch.where(depth_map.keep, values, 0.0)
-
-
 def map_to_samples(depth_map: DepthMap, frame: Frame, method: Method) -> tuple[MergedDepth, Tensor]:
     """Depth map -> samples (B, h · w), one per pixel, and their hole classes from stages 2 and 3 of the method.
 
     Gradient: to depth and sigma.
     """
-    uv = dense.map_pixel_centres(frame, (depth_map.depth.shape[-2], depth_map.depth.shape[-1]))
+    uv = dense.map_pixel_centres(frame, tuple(depth_map.depth.shape[-2:]))
     with torch.no_grad():
         hole = method.sample_depth_at(frame, uv).hole
-    depth, sigma = (zero_unanswered(depth_map, values).flatten(1) for values in (depth_map.depth, depth_map.sigma))
+    depth, sigma = (torch.where(depth_map.keep, x, 0.0).flatten(1) for x in (depth_map.depth, depth_map.sigma))
     score, source = depth_map.score.flatten(1), depth_map.source.flatten(1)
     return MergedDepth(uv.expand(len(hole), -1, -1), depth, sigma, score, source), hole

@@ -27,9 +27,6 @@ POSE_KINDS = ("world_from_cam", "1_from_0")
 #: A constant relative pose: 3x4 or 4x4 numbers.
 PoseMatrix = Sequence[Sequence[float]]
 
-#: Maximum deviation of R·Rᵀ of a stored rotation from the identity.
-_MAX_ROTATION_ERROR = 0.01
-
 
 def pose_label(pose: str | PoseMatrix) -> str:
     """Name of a pose in messages."""
@@ -101,14 +98,14 @@ def read_pose_priors(
     for place in at[1]:
         if kind == "1_from_0":
             T_1_from_0 = conventions.motion_from_axes(_read_pose(leaves, name, T[1], place, unit, checks), M)
-            pose_cov = None if not isinstance(cov, str) else _read_covariance(leaves, cov, T[1], place)
+            pose_cov = None if not isinstance(cov, str) else _read_matrix(leaves, cov, T[1], place, ((6,), 6))
             priors.append(pose_prior.make_prior(T_1_from_0, cov=pose_cov, **options))
             continue
         world_0 = conventions.pose_from_axes(_read_pose(leaves, name, T[0], at[0], unit, checks), M)
         world_1 = conventions.pose_from_axes(_read_pose(leaves, keys[1] or name, T[1], place, unit, checks), M)
         pose_cov = None
         if isinstance(cov, str):
-            covs = _read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)
+            covs = (_read_matrix(leaves, cov, *row, ((6,), 6)) for row in ((T[0], at[0]), (T[1], place)))
             pose_cov = conventions.relative_covariance(world_1, *covs)
         priors.append(pose_prior.relative_prior(world_0, world_1, cov=pose_cov, **options))
     return stack(priors).to(leaves.dtype)
@@ -138,9 +135,7 @@ def warn_refuted_poses(fits: Sequence[PoseFit], paired: Tensor, matched: Tensor,
         matched: (B,) from :func:`match_refuted_poses`.
         name: of the pose in the message.
     """
-    refuted = torch.zeros_like(paired)
-    for fit in fits:
-        refuted = refuted | (paired & (fit.code == PoseCode.REFUTED))
+    refuted = paired & torch.stack([fit.code == PoseCode.REFUTED for fit in fits]).any(0) if fits else paired & False
     if bool(refuted.any()):
         conventions_seen = [conventions.CONVENTIONS[i] for i in sorted(set(matched[refuted].tolist())) if i]
         guess = f"; looks like {' or '.join(conventions_seen)}" if conventions_seen else ""
@@ -156,7 +151,12 @@ def _read_matrix(
         matrix = torch.as_tensor(np.asarray(key), dtype=torch.float64, device=leaves.like.device)
         return matrix.expand(leaves.like.shape[0], *matrix.shape)
     value = get_value(leaves.sample, key)
-    x = leaves.per_sample(_world_from_kornia(value, key)) if is_kornia_camera(value) else leaves.get(key)
+    if not is_kornia_camera(value):
+        x = leaves.get(key)
+    elif not hasattr(value, "extrinsics"):
+        raise SampleError(f"{key}: found {type(value).__name__}, expected a pose or a PinholeCamera")
+    else:  # its extrinsics map the world into the camera
+        x = leaves.per_sample(se3.to_matrix(se3.invert(Pose.from_kornia(value))))
     rows, columns = tail
     shape = tuple(x.shape[1:])
     if x.ndim == 4 and x.shape[1] in (1, T):
@@ -165,17 +165,6 @@ def _read_matrix(
         expected = " or ".join(f"{r}x{columns}" for r in rows)
         raise SampleError(f"{key}: found shape {shape}, expected {expected}, with or without {T} in front")
     return x.double()
-
-
-def _world_from_kornia(camera: Any, key: str) -> Tensor:
-    """World_from_cam (n, 4, 4) of a camera of kornia, whose extrinsics map the world into the camera."""
-    if not hasattr(camera, "extrinsics"):
-        raise SampleError(f"{key}: found {type(camera).__name__}, expected a pose or a PinholeCamera")
-    return se3.to_matrix(se3.invert(Pose.from_kornia(camera)))
-
-
-def _read_covariance(leaves: SampleReader, key: str, T: int, at: int) -> Tensor:
-    return _read_matrix(leaves, key, T, at, ((6,), 6))
 
 
 def _read_pose(leaves: SampleReader, source: str | PoseMatrix, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
@@ -189,9 +178,7 @@ def _read_pose(leaves: SampleReader, source: str | PoseMatrix, T: int, at: int, 
         det = (torch.linalg.cross(safe[:, 0], safe[:, 1]) * safe[:, 2]).sum(-1)
         error = (safe @ safe.mT - eye).abs().flatten(1).amax(1)
         checks.append((det < 0, det, f"{key}: the determinant is {{:.4g}}, a reflection: are the axes left-handed?"))
-        checks.append(
-            (error > _MAX_ROTATION_ERROR, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3")
-        )
+        checks.append((error > 0.01, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3"))
         if x.shape[1] == 4:
             last = (x[:, 3] - torch.tensor([0.0, 0, 0, 1]).to(x)).abs().amax(-1)
             text = f"{key}: the last row is off 0 0 0 1 by {{:.4g}}; is the matrix transposed?"

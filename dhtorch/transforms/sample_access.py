@@ -5,15 +5,14 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import all_known, is_transformed
-from dhtorch.geometry.least_squares import has_graph
+from dhtorch.geometry.checks import all_known
 from dhtorch.pipeline.inputs import EXPECTED_IMAGE, dtype_name
 from dhtorch.records import Camera
 
@@ -32,11 +31,6 @@ KeyOrCamera: TypeAlias = "KeyOrNumbers | PinholeCamera | CameraModelBase"
 _SIGNED_DTYPES = {torch.uint16: torch.int32, torch.uint32: torch.int64}
 
 
-#: Limits how far the last row of an intrinsic matrix may be off 0 0 1, without unit: rounding.
-#: Source: derived, single precision; a transposed matrix is off by its principal point in pixels.
-MAX_LAST_ROW_ERROR = 1e-3
-
-
 class SampleError(ValueError):
     """A sample does not match its specification; the message names the key, what was found and what was expected."""
 
@@ -47,15 +41,23 @@ def get_value(sample: Mapping[str, Any], key: str) -> Any:
     Raises:
         SampleError: the key is missing.
     """
-    value = _look_up(sample, key)
-    if value is _MISSING:
-        raise SampleError(f"{key}: found no such key, expected one of {', '.join(_list_keys(sample))}")
+    if key in sample:
+        return sample[key]
+    value: Any = sample
+    for piece in key.replace("/", ".").split("."):
+        if not (isinstance(value, Mapping) and piece in value):
+            raise SampleError(f"{key}: found no such key, expected one of {', '.join(_list_keys(sample))}")
+        value = value[piece]
     return value
 
 
 def has_key(sample: Mapping[str, Any], key: str) -> bool:
     """Whether a sample has a key, by the lookup of :func:`get_value`."""
-    return _look_up(sample, key) is not _MISSING
+    try:
+        get_value(sample, key)
+    except SampleError:
+        return False
+    return True
 
 
 def drop_keys(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
@@ -87,21 +89,6 @@ def is_kornia_camera(value: Any) -> bool:
     return type(value).__module__.partition(".")[0] == "kornia"
 
 
-#: Sentinel for a missing key.
-_MISSING = object()
-
-
-def _look_up(sample: Mapping[str, Any], key: str) -> Any:
-    if key in sample:
-        return sample[key]
-    value: Any = sample
-    for piece in key.replace("/", ".").split("."):
-        if not (isinstance(value, Mapping) and piece in value):
-            return _MISSING
-        value = value[piece]
-    return value
-
-
 def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     """Array, image, numbers or tensor of any class -> plain tensor; ``signed`` converts uint16 and uint32 to signed.
 
@@ -118,15 +105,6 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
         array = array.astype(np.int32 if array.dtype.itemsize == 2 else np.int64)
     array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
     return torch.from_numpy(np.ascontiguousarray(array))
-
-
-def numbers_fingerprint(value: Any) -> Hashable | None:
-    """Numbers -> hashable fingerprint of bytes, dtype and shape; None for non-numpy types, graphs, other devices."""
-    if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
-        value = value.numpy() if value.is_cpu and not has_graph(value) else value
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif":
-        return None
-    return value.tobytes(), value.dtype.str, value.shape
 
 
 #: Keys of integers: one in a sample, one per sample in a collated batch.
@@ -245,20 +223,6 @@ class SampleReader:
             )
         return x
 
-    def fingerprint(self, numbers: KeyOrCamera) -> Hashable | None:
-        """Numbers -> cache key of the tensors read from them; None if they cannot be cached.
-
-        These are numbers with a graph, on another device or of a type unknown to numpy, and all in inference mode,
-        whose tensors cannot be used outside it.
-        """
-        if torch.is_inference_mode_enabled():
-            return None
-        value = get_value(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
-        digest = numbers_fingerprint(value)
-        if digest is None or self.like is None:
-            return None
-        return digest, self.dtype, self.like.device, self.batched, len(self.like)
-
     def camera(
         self, numbers: KeyOrCamera, T: int, at: int, distortion: Tensor | None, checks: list[Any] | None = None
     ) -> Camera:
@@ -277,7 +241,8 @@ class SampleReader:
             last = (x[:, 6:] - x.new_tensor([0.0, 0, 1])).detach().abs().amax(-1)
             if not (last.device.type == "cpu" and all_known(last == 0)):
                 text = f"{name}: the last row is off 0 0 1 by {{:.4g}}; is the matrix transposed?"
-                checks.append((~(last < MAX_LAST_ROW_ERROR), last, text))
+                # 1e-3 is far above single precision; a transposed matrix is off by its principal point in pixels.
+                checks.append((~(last < 1e-3), last, text))
         return Camera(x[:, 0:5:4].contiguous(), x[:, 2:6:3].contiguous(), distortion)
 
     def _kornia_camera(self, value: Any, name: str, T: int, at: int, distortion: Tensor | None) -> Camera:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -32,23 +32,8 @@ from dhtorch.transforms.sample_access import KeyOrCamera, KeyOrNumbers, SampleEr
 #: Named depth units -> units per metre.
 SAMPLE_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
-#: Maximum number of pixels from which the median depth of a frame is computed.
-_MAX_PROBES = 1024
-
-#: Maximum number of cached cameras; a recording has one, or one per frame.
-MAX_CACHED_CAMERAS = 64
-
 #: Relative distance from a limit beyond which float32 rounding cannot change the result of a check.
 _ROUNDING_REL = 1e-5
-
-#: Maximum relative difference of the aspect ratios of image and depth map; a transposed map differs by far more.
-_MAX_ASPECT_MISMATCH = 0.1
-
-#: Options that may name a key.
-_KEY_OPTIONS = (
-    *("image", "depth", "confidence", "intrinsics", "distortion", "depth_intrinsics"),
-    *("other_image", "other_intrinsics", "pose", "pose_cov", "other_pose"),
-)
 
 
 class SampleViews(NamedTuple):
@@ -77,13 +62,10 @@ AUTO_UNIT = "auto"
 #: Value of ``depth_range``, m: every depth is a return.
 NO_LIMITS = (0.0, math.inf)
 
-#: Start of the names of LeRobot's pictures.
-_LEROBOT_PICTURES = "observation.images."
-
 
 def default_prefix(image: str) -> str:
     """Key of the picture -> prefix of added keys: for names of LeRobot's pictures one that its processors keep."""
-    return "observation.dh_" if image.startswith(_LEROBOT_PICTURES) else "dhtorch."
+    return "observation.dh_" if image.startswith("observation.images.") else "dhtorch."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +110,6 @@ class SampleSpec:
     max_depth: float = 100.0  # m, a larger median depth means a wrong unit
     min_depth: float = 0.01  # m, a smaller median depth means a wrong unit
     min_focal: float = 0.05  # smaller focal lengths, as a fraction of the longer image side, are of another unit
-    _cameras: dict[Any, Camera] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache
 
     def __post_init__(self) -> None:
         unit = self.depth_unit
@@ -163,12 +144,15 @@ class SampleSpec:
         planes = leaves.planes(self.metric_depth_key if ready else self.depth, T, signed=False)
         depths = planes if ready else self.metres([planes])[0]
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
-        has_returns, failed = self._check_depth(depth)
+        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
+        has_returns, failed = _check_returns(depth, spec=self, low=low, high=high)
         checks += failed
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
             conf = conf[:, at if conf.shape[1] > 1 else 0]
-            checks.append(_confidence_check(conf, self.confidence))
+            high = conf.flatten(1).amax(1)
+            text = f"{self.confidence}: found the value {{:.4g}}, expected 0 low, 1 medium, 2 high"
+            checks.append((~(high <= 2) | (conf != conf.floor()).flatten(1).any(1), high, text))
             conf = conf.clamp(0, 2).to(torch.uint8).contiguous()
             if conf.shape != depth.shape:
                 raise SampleError(
@@ -212,7 +196,10 @@ class SampleSpec:
 
     def keys(self) -> tuple[str, ...]:
         """The keys that are read from a sample, without the ``_is_pad`` keys."""
-        values = (getattr(self, name) for name in _KEY_OPTIONS)
+        values = (
+            *(self.image, self.depth, self.confidence, self.intrinsics, self.distortion, self.depth_intrinsics),
+            *(self.other_image, self.other_intrinsics, self.pose, self.pose_cov, self.other_pose),
+        )
         return tuple(dict.fromkeys(key for key in values if isinstance(key, str)))
 
     def number_keys(self) -> tuple[str, ...]:
@@ -319,11 +306,6 @@ class SampleSpec:
         unit = self.depth_unit
         return 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
 
-    def _check_depth(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
-        """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit."""
-        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
-        return _check_returns(depth, spec=self, low=low, high=high)
-
     def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
         """Probed depths (B, k) -> checks of their median; none if all medians lie within the limits."""
         median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
@@ -338,18 +320,12 @@ class SampleSpec:
     def _camera(
         self, leaves: SampleReader, numbers: KeyOrCamera, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
-        fingerprint = None if self.distortion is not None else leaves.fingerprint(numbers)
-        cache_key = (fingerprint, hw, T, at)
-        if fingerprint is not None and cache_key in self._cameras:
-            return self._cameras[cache_key]
         failed: list[Any] = []
         camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at), failed)
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         least = self.min_focal * max(hw)
         if not failed and _is_clearly_plausible(camera, least):
-            if fingerprint is not None and len(self._cameras) < MAX_CACHED_CAMERAS:
-                self._cameras[cache_key] = camera
             return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
         small, centre = camera.f.detach().amin(-1), camera.c.detach().sum(-1)
@@ -367,7 +343,7 @@ class SampleSpec:
             return leaves.camera(self.depth_intrinsics, T, at, None)
         check_sample_orientation(self.depth, depth, hw)
         h, w = depth.shape[-2:]
-        if abs((h * hw[1]) / (w * hw[0]) - 1) > _MAX_ASPECT_MISMATCH:
+        if abs((h * hw[1]) / (w * hw[0]) - 1) > 0.1:  # a transposed map differs by far more
             raise SampleError(
                 f"{self.depth}: found {h}x{w} (height x width), which is no scaled image of {hw[0]}x{hw[1]}; a map "
                 "with another field of view needs depth_intrinsics"
@@ -381,14 +357,9 @@ def check_sample_orientation(key: str, depth: Tensor, hw: tuple[int, int]) -> No
         raise SampleError(f"{key}: the orientation differs: {mismatch} (width x height); turn one of them and its K")
 
 
-def _probe_depth(depth: Tensor) -> Tensor:
-    """Maps (B, h, w) -> evenly spaced values (B, k) of each, copied once because strided reads are slow."""
-    return depth.flatten(1)[:, :: _probe_stride(depth)].contiguous()
-
-
 def _probe_stride(depth: Tensor) -> int:
-    """Step between probed values of flattened maps (…, h, w)."""
-    return max(1, depth.shape[-2] * depth.shape[-1] // _MAX_PROBES)
+    """Step between the values of flattened maps (…, h, w), 1024 at least, of which the median depth is computed."""
+    return max(1, depth.shape[-2] * depth.shape[-1] // 1024)
 
 
 def _check_returns_kernel(depth: Tensor, *, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
@@ -406,19 +377,22 @@ def _check_returns(depth: Tensor, *, spec: SampleSpec, low: float, high: float) 
 
 
 def _check_returns_reference(depth: Tensor, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
-    probes = _probe_depth(depth.detach())
-    return _has_return(depth, probes), spec._depth_checks(probes, low, high)
-
-
-def _has_integer_unit(*_: Tensor, signed: bool, unit: str | float) -> bool:
-    return isinstance(unit, str)
+    # Evenly spaced values (B, k), copied once because strided reads are slow.
+    probes = depth.detach().flatten(1)[:, :: _probe_stride(depth)].contiguous()
+    has_probe = (probes > 0).any(1)
+    has_returns = has_probe if depth.is_cpu and all_known(has_probe) else depth.amax((1, 2)) > 0
+    return has_returns, spec._depth_checks(probes, low, high)
 
 
 def _write_metres_kernel(into: Tensor, words: Tensor, *, signed: bool, unit: str) -> None:
     torch.ops.dhtorch.write_metres.default(words, into, SAMPLE_UNITS_PER_METRE[unit], signed)
 
 
-@operator(kernel=_write_metres_kernel, dtypes={"into": torch.float32, "words": torch.int16}, when=_has_integer_unit)
+@operator(
+    kernel=_write_metres_kernel,
+    dtypes={"into": torch.float32, "words": torch.int16},
+    when=lambda *_, signed, unit: isinstance(unit, str),
+)
 def _write_metres(into: Tensor, words: Tensor, *, signed: bool, unit: str | float) -> None:
     """Fill ``into`` (…) with metres, 0 = no return, from the 16-bit integers ``words`` (…), signed or unsigned."""
     _to_metres(into.copy_(words if signed else words.view(torch.uint16)), signed, unit)
@@ -434,12 +408,6 @@ def _to_metres(x: Tensor, signed: bool, unit: str | float) -> Tensor:
     # A pass over a whole map costs as much as the front end: as few passes as possible.
     x = x.relu_() if signed else x
     return x.div_(SAMPLE_UNITS_PER_METRE[unit]) if isinstance(unit, str) else x.mul_(float(unit))
-
-
-def _has_return(depth: Tensor, probes: Tensor) -> Tensor:
-    """Maps (B, h, w) -> whether each has a return (B,); reads all pixels only if some map has none in its probes."""
-    has_probe = (probes > 0).any(1)
-    return has_probe if depth.is_cpu and all_known(has_probe) else depth.amax((1, 2)) > 0
 
 
 def _frame_index(at: int, T: int, key: str) -> int:
@@ -472,12 +440,6 @@ def _unit_range_checks(image: Tensor, key: str) -> list[tuple[Tensor, Tensor, st
     low, high = (f(image.detach(), (1, 2, 3)) for f in (torch.amin, torch.amax))  # no copy for any layout
     bad_low, bad_high = ~(low >= -1e-3), ~(high <= 1 + 1e-3)
     return [(bad_low | bad_high, torch.where(bad_high, high, low), text)]
-
-
-def _confidence_check(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
-    high = conf.flatten(1).amax(1)
-    text = f"{key}: found the value {{:.4g}}, expected 0 low, 1 medium, 2 high"
-    return ~(high <= 2) | (conf != conf.floor()).flatten(1).any(1), high, text
 
 
 def _format_hw(x: Tensor) -> str:

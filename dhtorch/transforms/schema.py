@@ -11,17 +11,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from operator import attrgetter as _of
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Cause, Flag, Gate, Hole, PoseCode, Source
+from dhtorch.codes import Cause, CodeTable, Flag, Gate, Hole, PoseCode, Source, code
 from dhtorch.records import DepthMap, Estimate, MergedDepth, PoseFit, Samples
-from dhtorch.transforms.maps import zero_unanswered
 from dhtorch.transforms.poses import match_refuted_poses
-from dhtorch.transforms.status import SampleProblem
 from dhtorch.transforms.tokens import TOKEN_CHANNELS
+
+
+class SampleProblem(CodeTable):
+    """Codes of ``problem``: the worst problem of a sample."""
+
+    NONE: Final = code(0, "none")
+    NO_SECOND_VIEW: Final = code(1, "front end only: one frame, or the source view only pads the episode")
+    NO_DEPTH: Final = code(2, "the sensor has no return at all")
+    UNREADABLE: Final = code(3, "left out; all added numbers are 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,40 +66,12 @@ class ColumnSpec(NamedTuple):
 # ------------------------------------------------------------------------------------------------ one function each
 
 
-def _uv(results: SampleResults) -> Tensor:
-    return results.merged.uv
-
-
 def _xyz(results: SampleResults) -> Tensor:
     return torch.where(_valid(results)[..., None], results.xyz, 0.0)
 
 
-def _depth(results: SampleResults) -> Tensor:
-    return results.merged.depth
-
-
-def _sigma(results: SampleResults) -> Tensor:
-    return results.merged.sigma
-
-
-def _score(results: SampleResults) -> Tensor:
-    return results.merged.score
-
-
 def _valid(results: SampleResults) -> Tensor:
     return results.merged.source != Source.NONE
-
-
-def _source(results: SampleResults) -> Tensor:
-    return results.merged.source
-
-
-def _flag(results: SampleResults) -> Tensor:
-    return results.samples.flag
-
-
-def _hole(results: SampleResults) -> Tensor:
-    return results.samples.hole
 
 
 def _gate(results: SampleResults) -> Tensor:
@@ -122,53 +102,14 @@ def _pose_ok(results: SampleResults) -> Tensor:
 def _pose_code(results: SampleResults) -> Tensor:
     if not results.fits:
         return torch.zeros_like(results.paired, dtype=torch.int32)
-    code = results.fits[-1].code
-    return torch.where(results.paired, code, torch.zeros_like(code))
+    last = results.fits[-1].code
+    return torch.where(results.paired, last, torch.zeros_like(last))
 
 
-def _tokens(results: SampleResults) -> Tensor:
-    return results.tokens[0]
-
-
-def _tokens_valid(results: SampleResults) -> Tensor:
-    return results.tokens[1]
-
-
-def _pose_convention(results: SampleResults) -> Tensor:
-    return match_refuted_poses(results.fits, results.paired)
-
-
-def _depth_map(results: SampleResults) -> Tensor:
-    return zero_unanswered(_dense(results), _dense(results).depth)
-
-
-def _sigma_map(results: SampleResults) -> Tensor:
-    return zero_unanswered(_dense(results), _dense(results).sigma)
-
-
-def _score_map(results: SampleResults) -> Tensor:
-    return _dense(results).score
-
-
-def _source_map(results: SampleResults) -> Tensor:
-    return _dense(results).source
-
-
-def _cause_map(results: SampleResults) -> Tensor:
-    return _dense(results).budget.dominating
-
-
-def _gate_map(results: SampleResults) -> Tensor:
-    return _dense(results).gate
-
-
-def _problem(results: SampleResults) -> Tensor:
-    return results.problem
-
-
-def _dense(results: SampleResults) -> DepthMap:
+def _answered(results: SampleResults, name: str) -> Tensor:
+    """Values (B, h, w) of a map, 0 where it has no depth."""
     assert results.dense is not None  # only columns of the option "dense" use it
-    return results.dense
+    return torch.where(results.dense.keep, getattr(results.dense, name), 0.0)
 
 
 # ------------------------------------------------------------------------------------------------------- the table
@@ -178,26 +119,39 @@ _ZERO = "0 = none, where a DepthMap has NaN"
 
 COLUMNS: tuple[ColumnSpec, ...] = (
     ColumnSpec(
-        "uv", ("N", 2), _F, "px", "where the samples are: x right, y down, whole numbers are pixel centres", _uv
+        "uv",
+        ("N", 2),
+        _F,
+        "px",
+        "where the samples are: x right, y down, whole numbers are pixel centres",
+        _of("merged.uv"),
     ),
     ColumnSpec(
         "xyz", ("N", 3), _F, "m", "points in the camera of the frame: x right, y down, z forward", _xyz, half=True
     ),
-    ColumnSpec("depth", _N, _F, "m", "z of the points, by sensor or triangulation; 0 = none", _depth, half=True),
-    ColumnSpec("sigma", _N, _F, "m", "standard deviation of depth; 0 = none", _sigma, half=True),
+    ColumnSpec(
+        "depth",
+        _N,
+        _F,
+        "m",
+        "z of the points, by sensor or triangulation; 0 = none",
+        _of("merged.depth"),
+        half=True,
+    ),
+    ColumnSpec("sigma", _N, _F, "m", "standard deviation of depth; 0 = none", _of("merged.sigma"), half=True),
     ColumnSpec(
         "score",
         _N,
         _F,
         "1",
         "confidence of the sensor, or score of the recovered depth, in [0, 1]",
-        _score,
+        _of("merged.score"),
         half=True,
     ),
     ColumnSpec("valid", _N, "bool", "1", "there is a depth", _valid),
-    ColumnSpec("source", _N, "int32", "code", "where the depth comes from", _source, codes=Source),
-    ColumnSpec("flag", _N, "int32", "bits", "what is wrong with the sensor's return", _flag, codes=Flag),
-    ColumnSpec("hole", _N, "int32", "code", "why the sensor gave no usable return", _hole, codes=Hole),
+    ColumnSpec("source", _N, "int32", "code", "where the depth comes from", _of("merged.source"), codes=Source),
+    ColumnSpec("flag", _N, "int32", "bits", "what is wrong with the sensor's return", _of("samples.flag"), codes=Flag),
+    ColumnSpec("hole", _N, "int32", "code", "why the sensor gave no usable return", _of("samples.hole"), codes=Hole),
     ColumnSpec("gate", _N, "int32", "code", "why no depth was recovered", _gate, codes=Gate),
     ColumnSpec(
         "T_1_from_0",
@@ -223,17 +177,17 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         _F,
         "1/m, 1/m, share",
         "depth tokens of the patches, row by row",
-        _tokens,
+        lambda results: results.tokens[0],
         half=True,
     ),
-    ColumnSpec("tokens_valid", _P, "bool", "1", "a sample of the patch has a depth", _tokens_valid),
+    ColumnSpec("tokens_valid", _P, "bool", "1", "a sample of the patch has a depth", lambda results: results.tokens[1]),
     ColumnSpec(
         "pose_convention",
         (),
         "int32",
         "index",
         "which of geometry.pose_conventions.CONVENTIONS a given pose would fit that the near returns refute; 0 = none",
-        _pose_convention,
+        lambda results: match_refuted_poses(results.fits, results.paired),
         option="pose",
     ),
     ColumnSpec(
@@ -242,7 +196,7 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         _F,
         "m",
         f"z of every pixel, by sensor or sweep; {_ZERO}",
-        _depth_map,
+        lambda results: _answered(results, "depth"),
         option="dense",
         half=True,
         enrich="tiff",
@@ -253,7 +207,7 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         _F,
         "m",
         f"standard deviation of depth_map; {_ZERO}",
-        _sigma_map,
+        lambda results: _answered(results, "sigma"),
         option="dense",
         half=True,
         enrich="tiff",
@@ -264,7 +218,7 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         _F,
         "1",
         "confidence of the sensor, or score of the swept depth, in [0, 1]",
-        _score_map,
+        _of("dense.score"),
         option="dense",
         half=True,
     ),
@@ -274,7 +228,7 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         "int32",
         "code",
         "where the depth of a pixel comes from",
-        _source_map,
+        _of("dense.source"),
         codes=Source,
         option="dense",
         enrich="png",
@@ -285,19 +239,28 @@ COLUMNS: tuple[ColumnSpec, ...] = (
         "int32",
         "code",
         "largest cause of a pixel's sigma",
-        _cause_map,
+        _of("dense.budget.dominating"),
         codes=Cause,
         option="budget",
         enrich="png",
     ),
-    ColumnSpec("gate_map", _MAP, "int32", "code", "why a pixel has no depth", _gate_map, codes=Gate, option="dense"),
+    ColumnSpec(
+        "gate_map",
+        _MAP,
+        "int32",
+        "code",
+        "why a pixel has no depth",
+        _of("dense.gate"),
+        codes=Gate,
+        option="dense",
+    ),
     ColumnSpec(
         "problem",
         (),
         "int32",
         "code",
         "what was wrong with the frame",
-        _problem,
+        _of("problem"),
         codes=SampleProblem,
         unreadable=SampleProblem.UNREADABLE,
     ),
@@ -307,17 +270,6 @@ COLUMNS: tuple[ColumnSpec, ...] = (
 def columns_of_options(options: Collection[str]) -> list[ColumnSpec]:
     """Active options of ExtendDepth (``pose``, ``dense``) -> columns, in order."""
     return [column for column in COLUMNS if column.option is None or column.option in options]
-
-
-def compute_columns(results: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
-    """Results and options -> key → values (B, …). Gradient: as the records' fields."""
-    return {column.key: column.compute(results) for column in columns_of_options(options)}
-
-
-def fill_unreadable(added: Mapping[str, Tensor], bad: Tensor) -> dict[str, Tensor]:
-    """Columns (B, …) and mask ``bad`` (B,) -> columns with the values of unreadable samples there. Gradient: kept."""
-    value = {column.key: column.unreadable for column in COLUMNS}
-    return {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), value[key]) for key, x in added.items()}
 
 
 def blank_columns(sizes: Mapping[str, int], options: Collection[str]) -> dict[str, Tensor]:

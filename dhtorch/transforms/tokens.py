@@ -127,7 +127,14 @@ def _pool_tokens(
 ) -> tuple[Tensor, Tensor]:
     """:func:`patch_tokens` of samples; ``grid``: side of a patch in px, rows and columns of patches."""
     patch, rows, columns = grid
-    cell = _patch_index(uv, scale, margin, patch=patch, rows=rows, columns=columns)
+    # Pixels (B, N, 2) -> index (B, N) of the patch that contains each; rows · columns if none does
+    position = uv.detach().double() + 0.5
+    position = position * (scale[0] if scale[0] == scale[1] else position.new_tensor(scale))
+    if any(margin):
+        position = position + position.new_tensor(margin)
+    column, row = (position / patch).floor().unbind(-1)
+    inside = (column.clamp(0, columns - 1) == column) & (row.clamp(0, rows - 1) == row)
+    cell = torch.where(inside, torch.add(column, row, alpha=columns), rows * columns).long()
 
     def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last for samples outside all patches
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
@@ -159,14 +166,3 @@ def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tup
         scale = [min(scale) if fit == "pad" else max(scale)] * 2
     margin = [(tokens_hw[k] - hw[k] * s) / 2 for k, s in zip((1, 0), scale, strict=True)]
     return scale, margin
-
-
-def _patch_index(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
-    """Pixels (B, N, 2) -> index (B, N) of the patch that contains each; rows · columns if none does."""
-    position = uv.detach().double() + 0.5
-    position = position * (scale[0] if scale[0] == scale[1] else position.new_tensor(scale))
-    if any(margin):
-        position = position + position.new_tensor(margin)
-    column, row = (position / patch).floor().unbind(-1)
-    inside = (column.clamp(0, columns - 1) == column) & (row.clamp(0, rows - 1) == row)
-    return torch.where(inside, torch.add(column, row, alpha=columns), rows * columns).long()

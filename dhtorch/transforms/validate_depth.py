@@ -19,9 +19,6 @@ from dhtorch.transforms.sample_access import SampleError, SampleReader, check_sa
 from dhtorch.transforms.sample_spec import SampleSpec, check_sample_orientation, default_prefix
 from dhtorch.validation.validate import validate_depth
 
-#: Numbers of a frame that are added with their confidence interval: value, low, high.
-_INTERVAL_KEYS = ("scale", "shift", "tilt", "wrong")
-
 
 class ValidateDepth(torch.nn.Module):
     """Sample dict with images and depth -> the same dict plus the validation of a depth map, per pixel and per frame.
@@ -94,44 +91,35 @@ class ValidateDepth(torch.nn.Module):
             read = self.views.read(sample, batched=self.batched)
             if bool(read.bad.any()):
                 raise SampleError(read.complaint())
-            depth = self._read_map(sample, read.reference)
+            depth = None
+            if self.map is not None:
+                leaves = SampleReader(sample, batched=self.batched, dtype=read.reference.camera.f.dtype)
+                leaves.like = read.reference.image
+                planes = leaves.planes(self.map, 1).to(read.reference.camera.f)
+                check_sample_orientation(self.map, planes, read.reference.hw)
+                depth = clear_no_depth(planes[:, 0] * self.map_unit, self.map_unit)
             validation = self._validate(depth, read.reference, None)
             if read.other is not None and bool(read.paired.any()):
                 with_source = self._validate(depth, read.reference, read.other)
                 rows = torch.arange(len(read.paired), device=read.paired.device)
                 validation = stack([validation, with_source])[read.paired.long(), rows]
-        added = _validation_keys(validation)
+        has_depth = validation.depth > 0
+        n_pixels = has_depth.sum((1, 2)).clamp_min(1)
+        states = (State.CANNOT_KNOW, State.CONSISTENT, State.WRONG)
+        fractions = [((validation.state == code) & has_depth).sum((1, 2)) / n_pixels for code in states]
+        added = {
+            "state": validation.state,
+            "evidence": validation.evidence.nan_to_num(0.0, 0.0, 0.0),
+            "state_share": torch.stack(fractions, -1).to(validation.depth),
+        }
+        for name in ("scale", "shift", "tilt", "wrong"):  # each with its confidence interval: value, low, high
+            value = getattr(validation, name)
+            added |= {name: value.nan_to_num(0.0, 0.0, 0.0), f"{name}_known": value.isfinite().all(-1)}
+        added["clip_depth"] = validation.clip_depth.nan_to_num(0.0)
+        added["clip_depth_known"] = validation.clip_depth.isfinite()
         return {**sample, **{self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}}
 
     def _validate(self, depth: Tensor | None, reference: Frame, others: Frame | None) -> DepthValidation:
         return validate_depth(
             depth, reference, others, method=self.method, seed=self.seed, hint=self.hint, **self.judging
         )
-
-    def _read_map(self, sample: Mapping[str, Any], reference: Frame) -> Tensor | None:
-        """The map to validate (B, h, w) m; None = the sensor's own depth."""
-        if self.map is None:
-            return None
-        leaves = SampleReader(sample, batched=self.batched, dtype=reference.camera.f.dtype)
-        leaves.like = reference.image
-        planes = leaves.planes(self.map, 1).to(reference.camera.f)
-        check_sample_orientation(self.map, planes, reference.hw)
-        return clear_no_depth(planes[:, 0] * self.map_unit, self.map_unit)
-
-
-def _validation_keys(validation: DepthValidation) -> dict[str, Tensor]:
-    """Validation of B frames -> added keys (B, …), all finite."""
-    has_depth = validation.depth > 0
-    n_pixels = has_depth.sum((1, 2)).clamp_min(1)
-    states = (State.CANNOT_KNOW, State.CONSISTENT, State.WRONG)
-    fractions = [((validation.state == code) & has_depth).sum((1, 2)) / n_pixels for code in states]
-    added = {
-        "state": validation.state,
-        "evidence": validation.evidence.nan_to_num(0.0, 0.0, 0.0),
-        "state_share": torch.stack(fractions, -1).to(validation.depth),
-    }
-    for name in _INTERVAL_KEYS:
-        value = getattr(validation, name)
-        added |= {name: value.nan_to_num(0.0, 0.0, 0.0), f"{name}_known": value.isfinite().all(-1)}
-    clip_depth = validation.clip_depth
-    return added | {"clip_depth": clip_depth.nan_to_num(0.0), "clip_depth_known": clip_depth.isfinite()}

@@ -1,49 +1,55 @@
-"""ExtendDepth: layouts and units, what it adds, data-loader workers, batches, tokens beside DINOv2, bad input."""
+"""ExtendDepth with methods of the package on the built-in room: what it adds, batches, workers, gradients, maps."""
 
 import copy
 import io
 import pickle
 import warnings
-from itertools import pairwise
+from inspect import signature
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from support.loader_batches import join_features, load_batches
 from support.sample_dicts import GAP, NEAR, SIDE, Frames, frames, room
+from support.stub_samples import added
 from torch.utils.data import default_collate
 
 import dhtorch
-from dhtorch import PAPER
+from dhtorch import MAP, PAPER
 from dhtorch.codes import Flag, Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.records import DepthValidation, Frame
+from dhtorch.pipeline import completion, dense
+from dhtorch.records import DepthValidation, Frame, MergedDepth
 from dhtorch.stages import score
 from dhtorch.transforms import (
+    DenseMaps,
     ExtendDepth,
     ExtendedDataset,
     SampleError,
     SampleProblem,
     SampleSpec,
     ValidateDepth,
-    collate_kept,
-    sample_spec,
+    patch_tokens,
     validate_depth,
 )
 
-extend_window = PAPER.replace(views=5)
+N, P, SIZE = 256, (SIDE // 14) ** 2, 84
+DENSE = {"planes": 24, "size": SIZE, "refinements": 1, "max_sigma_rel": 0.3}
+MAPS = {"depth_map": torch.float32, "sigma_map": torch.float32, "score_map": torch.float32}
+MAPS |= {"source_map": torch.int32, "gate_map": torch.int32}
 
-N = 256
-P = (SIDE // 14) ** 2
 
-
-def transform(**options):
+def sparse(**options):
     return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "n": N, **options})
+
+
+def mapped(**options):
+    return sparse(**{"method": MAP.replace(n=N), "dense": DENSE, "n": None, **options})
 
 
 @pytest.fixture(scope="module")
 def items():
+    torch.set_num_threads(1)
     return list(frames())
 
 
@@ -52,22 +58,23 @@ def sample(items):
     return {**items[GAP], "before": items[0]["image"]}
 
 
-def added(out, prefix="dhtorch."):
-    return {k.removeprefix(prefix): v for k, v in out.items() if k.startswith(prefix)}
+@pytest.fixture(scope="module")
+def pair(items):
+    """What is added to a sample with two views, with maps and without."""
+    whole = {**items[GAP], "before": items[0]["image"]}
+    return added(mapped()(whole)), added(mapped(dense=False)(whole))
 
 
 def same(a, b):
-    a, b = added(a), added(b)
-    assert a.keys() == b.keys()
-    return [k for k in a if not torch.equal(torch.as_tensor(a[k]), torch.as_tensor(b[k]))] == []
+    return a.keys() == b.keys() and all(torch.equal(torch.as_tensor(a[k]), torch.as_tensor(b[k])) for k in a)
 
 
 # ---------------------------------------------------------------------------------------------------- what it adds
 
 
-def test_it_adds_what_the_method_answers(sample, items):
+def test_it_adds_what_the_method_answers(sample):
     before = copy.deepcopy(sample)
-    out = transform()(sample)
+    out = sparse()(sample)
     assert out is not sample and all(out[k] is sample[k] for k in sample)
     assert all(np.array_equal(sample[k], before[k]) for k in sample), "the sample is not changed in place"
     read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
@@ -90,14 +97,9 @@ def test_it_adds_what_the_method_answers(sample, items):
 SHAPES = {
     "uv": ((N, 2), torch.float32),
     "xyz": ((N, 3), torch.float32),
-    "depth": ((N,), torch.float32),
-    "sigma": ((N,), torch.float32),
-    "score": ((N,), torch.float32),
+    **dict.fromkeys(("depth", "sigma", "score"), ((N,), torch.float32)),
     "valid": ((N,), torch.bool),
-    "source": ((N,), torch.int32),
-    "flag": ((N,), torch.int32),
-    "hole": ((N,), torch.int32),
-    "gate": ((N,), torch.int32),
+    **dict.fromkeys(("source", "flag", "hole", "gate"), ((N,), torch.int32)),
     "T_1_from_0": ((4, 4), torch.float32),
     "pose_cov": ((6, 6), torch.float32),
     "pose_ok": ((), torch.bool),
@@ -106,99 +108,67 @@ SHAPES = {
     "tokens_valid": ((P,), torch.bool),
     "problem": ((), torch.int32),
 }
+BOTH = {Source.SENSOR, Source.SWEPT}
+
+#: What is done to the sample -> (options, changes, problem, sources of the map's pixels with depth).
+CASES = {
+    "pair": ({}, lambda s: {}, SampleProblem.NONE, BOTH),
+    "one view": ({"other_image": None}, lambda s: {}, SampleProblem.NO_SECOND_VIEW, {Source.SENSOR}),
+    "padded": ({}, lambda s: {"before_is_pad": np.array([True])}, SampleProblem.NO_SECOND_VIEW, {Source.SENSOR}),
+    "no depth": ({}, lambda s: {"depth": 0 * s["depth"]}, SampleProblem.NO_DEPTH, set()),
+    "nan depth": ({}, lambda s: {"depth": np.full((SIDE, SIDE), np.nan, np.float32)}, SampleProblem.NO_DEPTH, set()),
+    "black": ({}, lambda s: {"image": 0 * s["image"]}, SampleProblem.NONE, {Source.SENSOR}),
+    "half": (
+        {},
+        lambda s: {k: torch.from_numpy(s[k]).permute(2, 0, 1).half() / 255 for k in ("image", "before")},
+        SampleProblem.NONE,
+        BOTH,
+    ),
+    "unreadable": ({"on_error": "flag"}, lambda s: {"depth": s["depth"][:, :50]}, SampleProblem.UNREADABLE, set()),
+}
 
 
-@pytest.mark.parametrize("what", ["pair", "one view", "no depth", "black", "nan depth", "padded", "unreadable"])
-def test_shapes_are_fixed_and_numbers_finite(sample, what):
-    options = {"other_image": None} if what == "one view" else {"on_error": "flag"} if what == "unreadable" else {}
-    if what == "no depth":
-        sample["depth"] = 0 * sample["depth"]
-    if what == "black":
-        sample["image"] = 0 * sample["image"]
-    if what == "nan depth":
-        sample["depth"] = np.full((SIDE, SIDE), np.nan, dtype=np.float32)
-    if what == "padded":
-        sample["before_is_pad"] = np.array([True])
-    if what == "unreadable":
-        sample["depth"] = sample["depth"][:, :50]
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("make", [sparse, mapped])
+def test_shapes_are_fixed_and_numbers_finite(sample, make, name):
+    options, change, problem, sources = CASES[name]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore" if what == "unreadable" else "error")
-        out = added(transform(**options)(sample))
-    assert {k: (tuple(v.shape), v.dtype) for k, v in out.items()} == SHAPES
-    assert all(v.isfinite().all() for v in out.values())
+        warnings.simplefilter("ignore" if name == "unreadable" else "error")
+        out = added(make(**options)({**sample, **change(sample)}))
+    wanted = SHAPES | ({k: ((SIZE, SIZE), t) for k, t in MAPS.items()} if make is mapped else {})
+    assert {k: (tuple(v.shape), v.dtype) for k, v in out.items()} == wanted
+    assert all(v.isfinite().all() for v in out.values()) and out["problem"] == problem
     for key in ("depth", "sigma", "score", "xyz"):
         assert (out[key][~out["valid"]] == 0).all(), key
-    expected = {
-        "no depth": SampleProblem.NO_DEPTH,
-        "nan depth": SampleProblem.NO_DEPTH,
-        "unreadable": SampleProblem.UNREADABLE,
-    }
-    expected |= {"one view": SampleProblem.NO_SECOND_VIEW, "padded": SampleProblem.NO_SECOND_VIEW}
-    assert out["problem"] == expected.get(what, SampleProblem.NONE)
-    if what in ("no depth", "nan depth"):
+    if make is mapped:
+        silent = out["source_map"] == Source.NONE
+        assert all((out[k][silent] == 0).all() for k in ("depth_map", "sigma_map", "score_map"))
+        assert bool((out["depth_map"][~silent] > 0).all()) and bool(out["gate_map"].any()) == (name != "unreadable")
+        assert set(out["source_map"].unique().tolist()) - {Source.FILLED} == {Source.NONE, *sources}
+    if problem == SampleProblem.NO_DEPTH:
         assert not out["valid"].any() and not out["pose_ok"] and (out["flag"] & Flag.NO_DEPTH).bool().all()
-    if what in ("one view", "padded"):
+    if problem == SampleProblem.NO_SECOND_VIEW:
         assert (out["gate"] == Gate.NO_TRACK).all() and not out["pose_ok"] and out["valid"].any()
         assert (out["source"][out["valid"]] == Source.SENSOR).all()
-
-
-def test_one_view_and_a_padded_pair_say_the_same(sample):
-    alone = transform(other_image=None)(sample)
-    assert same(alone, transform()({**sample, "before_is_pad": torch.tensor([True])}))
-
-
-# ---------------------------------------------------------------------------------------------------- layouts and units
+        assert same(out, added(make(other_image=None)(sample)))
 
 
 @pytest.mark.parametrize("batched", [False, True])
 def test_a_map_with_one_return_where_no_sample_is_has_depth(sample, batched):
-    ask = transform(other_image=None, batched=batched)
-    maps = [np.array(sample["depth"]), 0 * np.array(sample["depth"]), 0 * np.array(sample["depth"])]
-    seen = added(transform(other_image=None)(sample))["uv"].round().long()
+    maps = [sample["depth"], 0 * sample["depth"], 0 * sample["depth"]]
+    seen = added(sparse(other_image=None)(sample))["uv"].round().long()
     at = next((v, u) for v in range(SIDE) for u in range(SIDE) if not (seen == torch.tensor([u, v])).all(-1).any())
     maps[1][at] = 1500
-    said = [SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_DEPTH]
-    samples = [sample | {"depth": x} for x in maps]
-    found = added(ask(default_collate(samples)))["problem"] if batched else [added(ask(s))["problem"] for s in samples]
-    assert list(found) == said
+    samples, transform = [sample | {"depth": x} for x in maps], sparse(other_image=None, batched=batched)
+    out = (
+        added(transform(default_collate(samples)))["problem"]
+        if batched
+        else [transform(s)["dhtorch.problem"] for s in samples]
+    )
+    assert list(out) == [SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_DEPTH]
 
 
-def as_float_chw(s):
-    image = {k: torch.from_numpy(s[k]).permute(2, 0, 1) / 255 for k in ("image", "before")}
-    return {**s, **image, "depth": torch.from_numpy(s["depth"].astype(np.int64))[None]}
-
-
-def as_time(s):
-    """Frames along time as ``delta_timestamps`` hands them out, the depth of the last one only."""
-    s = as_float_chw(s)
-    s["image"] = torch.stack((s.pop("before"), s["image"]))
-    return {**s, "image_is_pad": torch.tensor([False, False])}
-
-
-def as_time_with_depth(s):
-    s = as_time(s)
-    return {**s, "depth": torch.stack((s["depth"] * 0, s["depth"])), "intrinsics": np.stack([s["intrinsics"]] * 2)}
-
-
-@pytest.mark.parametrize(
-    ("change", "options"),
-    [
-        (as_float_chw, {}),
-        (as_time_with_depth, {"other_image": None}),
-        (lambda s: {**s, "depth": (s["depth"] / 1000).astype(np.float64)}, {"depth_unit": "m"}),
-    ],
-)
-def test_layouts_of_one_sample_give_one_answer(sample, change, options):
-    assert same(transform()(sample), transform(**options)(change(sample)))
-
-
-def test_a_half_type_of_torch_is_lifted(sample):
-    sample = as_float_chw(sample)
-    changed = {k: sample[k].to(torch.bfloat16) for k in ("image", "before", "depth")}
-    out = added(transform()({**sample, **changed}))
-    assert out["depth"].dtype == torch.float32 and all(v.isfinite().all() for v in out.values())
-    both = out["valid"] & added(transform()(sample))["valid"]
-    assert both.sum() > 100 and out["pose_ok"]
+# ------------------------------------------------------------------------------------------------ cameras and methods
 
 
 def test_two_cameras_answer_as_the_method_with_two_cameras(sample, items):
@@ -212,166 +182,84 @@ def test_two_cameras_answer_as_the_method_with_two_cameras(sample, items):
     trace = {}
     estimate = dhtorch.extend(Frame(image, mm / 1000, one), Frame(before, 0 * mm, two), n=N, trace=trace)
     found = dhtorch.merge(trace["samples"], estimate)
-    own, shared = (added(transform(other_intrinsics=k)(sample)) for k in ("K_before", None))
+    own, shared = (added(sparse(other_intrinsics=k)(sample)) for k in ("K_before", None))
     assert torch.equal(own["depth"], found.depth[0]) and torch.equal(own["sigma"], found.sigma[0])
     assert torch.equal(own["T_1_from_0"][:3, 3], trace["fit"].T_1_from_0.t[0]) and own["pose_ok"]
     assert not torch.allclose(own["T_1_from_0"], shared["T_1_from_0"], atol=1e-3)
-    plain = added(transform()({**sample, "before": items[0]["image"]}))
-    apart = (own["T_1_from_0"] - plain["T_1_from_0"]).abs().max()
-    assert apart < 0.02 < (shared["T_1_from_0"] - plain["T_1_from_0"]).abs().max(), (
-        "the same motion, whatever was cut out"
-    )
+    plain = added(sparse()({**sample, "before": items[0]["image"]}))["T_1_from_0"]
+    apart, wrong = ((x["T_1_from_0"] - plain).abs().max() for x in (own, shared))
+    assert apart < 0.02 < wrong, "the same motion, whatever was cut out"
 
 
-def test_a_depth_map_of_its_own_size_and_camera(sample):
-    half = sample["depth"][1::2, 1::2]
-    K = sample["intrinsics"]
+def test_a_depth_map_of_its_own_size_and_camera_and_low_confidence(sample):
+    half, K = sample["depth"][1::2, 1::2], sample["intrinsics"]
     # Pixels 1, 3, 5, … of the image: a camera whose pixel centres are exactly those.
     own = [K[0, 0] / 2, K[1, 1] / 2, (K[0, 2] - 1) / 2, (K[1, 2] - 1) / 2]
-    read = SampleSpec(depth_unit="mm", depth_intrinsics=own).read({**sample, "depth": half})
-    assert read.reference.depth_camera is not None and read.reference.depth.shape == (1, SIDE // 2, SIDE // 2)
-    out = added(transform(depth_intrinsics=own)({**sample, "depth": half}))
-    whole = added(transform()(sample))
+    out, whole = added(sparse(depth_intrinsics=own)({**sample, "depth": half})), added(sparse()(sample))
     both = (out["source"] == Source.SENSOR) & (whole["source"] == Source.SENSOR)
     assert both.sum() > 20 and ((out["depth"] / whole["depth"])[both] - 1).abs().median() < 0.01
-    with pytest.raises(SampleError, match="no scaled image"):
-        transform()({**sample, "depth": np.repeat(sample["depth"], 2, 0)})
-
-
-def test_low_confidence_is_no_return(sample):
     conf = np.zeros((SIDE, SIDE), np.uint8)
     conf[: SIDE // 2] = 2
-    out = added(transform(confidence="conf")({**sample, "conf": conf}))
+    out = added(sparse(confidence="conf")({**sample, "conf": conf}))
     low = (out["flag"] & Flag.LOW_CONF) != 0
     assert low.any() and (out["uv"][low][:, 1] >= SIDE // 2 - 0.5).all() and (out["source"][low] != Source.SENSOR).all()
 
 
-# ---------------------------------------------------------------------------------------------------- methods and seeds
+class Scorer(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, estimate, samples, tracks, fit):
+        ranked = score.confidence(estimate, samples, tracks, fit)
+        return ranked.replace(score=ranked.score * self.gain)
 
 
-def test_any_method_will_do(sample):
-    quiet = dhtorch.extend.replace(score={"min_score": 0.9}, n=64)
-    out = added(ExtendDepth(depth_unit="mm", other_image="before", method=quiet)(sample))
-    assert out["depth"].shape == (64,)
-    assert not ((out["source"] == Source.RECOVERED) & (out["score"] < 0.9)).any()
-
-
-def test_a_learned_part_is_a_part_of_the_module(sample):
-    class Scorer(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.gain = torch.nn.Parameter(torch.tensor(0.5))
-
-        def forward(self, estimate, samples, tracks, fit):
-            ranked = score.confidence(estimate, samples, tracks, fit)
-            return ranked.replace(score=ranked.score * self.gain)
-
-    module = transform(method=dhtorch.extend.replace(score=Scorer()))
-    assert [p.shape for p in module.parameters()] == [()]
-    out = added(module(sample))
-    out["score"].sum().backward()
+def test_any_method_serves_and_a_learned_part_is_a_part_of_the_module(sample, items):
+    out = added(sparse(method=dhtorch.extend.replace(score={"min_score": 0.9}, n=64), n=None)(sample))
+    assert out["depth"].shape == (64,) and not ((out["source"] == Source.RECOVERED) & (out["score"] < 0.9)).any()
+    module = sparse(method=dhtorch.extend.replace(score=Scorer()))
     (gain,) = module.parameters()
-    assert gain.grad > 0
-    assert torch.equal(
-        out["score"][out["source"] == Source.RECOVERED],
-        0.5 * added(transform()(sample))["score"][out["source"] == Source.RECOVERED],
-    )
-
-
-def test_many_views_for_a_method_of_many(items):
-    images = np.stack([items[k]["image"] for k in (0, 3, 4, GAP)])
-    sample = {**items[GAP], "image": images}
-    many = ExtendDepth(depth_unit="mm", method=extend_window, other_at=(0, 1, 2), n=N)
-    pair, out = added(transform(other_image=None)(sample)), added(many(sample))
-    assert {k: v.shape for k, v in out.items()} == {k: v.shape for k, v in pair.items()}
+    out, plain = added(module(sample)), added(sparse()(sample))
+    out["score"].sum().backward()
+    recovered = out["source"] == Source.RECOVERED
+    assert gain.grad > 0 and torch.equal(out["score"][recovered], 0.5 * plain["score"][recovered])
+    many = {**items[GAP], "image": np.stack([items[k]["image"] for k in (0, 3, 4, GAP)])}
+    out = added(ExtendDepth(depth_unit="mm", method=PAPER.replace(views=5), other_at=(0, 1, 2), n=N)(many))
+    assert {k: v.shape for k, v in out.items()} == {k: v.shape for k, v in plain.items()}
     assert (out["source"] == Source.RECOVERED).any()
-    assert ExtendDepth(depth_unit="mm", other_at=1, n=N).views.read(sample).other.image.shape == (1, 3, SIDE, SIDE)
+    seeds = [sparse(seed=3, index_key="index"), sparse(index_key="index"), sparse(seed=7)]
+    covs = [added(t({**sample, "index": i}))["pose_cov"] for t, i in zip(seeds, (4, 7, 0), strict=True)]
+    assert torch.equal(covs[0], covs[1]) and torch.equal(covs[0], covs[2])
 
 
-def test_seeds(sample):
-    one, two = (
-        added(transform(seed=s, index_key="index")({**sample, "index": i}))["pose_cov"] for s, i in ((3, 4), (0, 7))
-    )
-    assert torch.equal(one, two)
-    same_draws = added(transform(seed=7)(sample))["pose_cov"]
-    assert torch.equal(one, same_draws)
+# ------------------------------------------------------------------------------------------------ batches and workers
 
 
-# ---------------------------------------------------------------------------------------------------- batches
-
-
-@pytest.mark.parametrize("options", [{}, {"index_key": "index", "distortion": [0.05, -0.02, 0.001, 0.0, 0.0]}])
-def test_a_batch_is_its_samples(items, options):
-    samples = [{**items[i], "before": items[i - GAP]["image"]} for i in range(GAP, 12)]
-    samples[1] = {**samples[1], "depth": 0 * samples[1]["depth"]}
-    samples[2] = {**samples[2], "before_is_pad": torch.tensor([True])}
-    samples = [{"before_is_pad": torch.tensor([False]), **s} for s in samples]
-    single, batched = transform(**options), transform(**options, batched=True)
-    together = added(batched(default_collate(samples)))
-    alone = added(default_collate([single(s) for s in samples]))
-    assert [k for k in alone if not torch.equal(alone[k], together[k])] == []
-    assert batched.report() == single.report() == {"none": 4, "no_second_view": 1, "no_depth": 1, "unreadable": 0}
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no accelerator")
-def test_a_batch_on_an_accelerator(items):
-    samples = default_collate([{**items[i], "before": items[i - GAP]["image"]} for i in range(GAP, 12)])
-    here = added(transform(batched=True)(samples))
-    moved = {k: v.cuda() if torch.is_tensor(v) else v for k, v in samples.items()}
-    there = {k: v.cpu() for k, v in added(transform(batched=True)(moved)).items()}
-    both = here["valid"] & there["valid"]
-    assert (here["valid"] == there["valid"]).float().mean() > 0.98
-    assert torch.allclose(here["depth"][both], there["depth"][both], rtol=1e-2)
-
-
-# ---------------------------------------------------------------------------------------------------- workers
-
-
-@pytest.fixture(scope="module")
-def in_process(items):
-    dataset = ExtendedDataset(Frames(items), transform(index_key="index", seed=5), gap=GAP)
-    return join_features(load_batches(dataset, 0)[0])
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning", "ignore:.*pin_memory.*:UserWarning")
 @pytest.mark.parametrize(
-    ("workers", "context", "batch", "options"),
+    ("make", "options", "n"),
     [
-        (0, None, 5, {}),
-        (2, "fork", 2, {"persistent_workers": True, "pin_memory": True}),
-        pytest.param(1, "spawn", 3, {}, marks=pytest.mark.slow),
+        (sparse, {}, 6),
+        (sparse, {"index_key": "index", "distortion": [0.05, -0.02, 0.001, 0.0, 0.0]}, 6),
+        (mapped, {"index_key": "index", "seed": 3}, 4),
     ],
 )
-def test_workers_and_batch_size_change_nothing(items, in_process, workers, context, batch, options):
-    extender = transform(index_key="index", seed=5)
-    dataset = ExtendedDataset(Frames(items), extender, gap=GAP)
-    batches, loader = load_batches(dataset, workers, context, batch, **options)
-    rows = join_features(batches)
-    assert [k for k, v in in_process.items() if not torch.equal(v, rows[k])] == []
-    assert all(not v.requires_grad for v in rows.values())
-    assert batches[0]["task"] == ["look around"] * batch and "before" not in batches[0]
-    if options.get("persistent_workers"):
-        again = join_features(list(loader))
-        assert all(torch.equal(v, again[k]) for k, v in rows.items())
-    episodes = 2 if options.get("persistent_workers") else 1
-    assert extender.report() == {"none": 3 * episodes, "no_second_view": 9 * episodes, "no_depth": 0, "unreadable": 0}
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_corrupt_samples_in_the_middle(items):
-    corrupt = {3, 8}
-    with pytest.raises(OSError, match="premature end"):
-        load_batches(ExtendedDataset(Frames(items, corrupt), transform(other_image=None)), 1, "fork")
-    skipping = transform(on_error="skip", other_image=None)
-    batches, _ = load_batches(ExtendedDataset(Frames(items, corrupt), skipping), 2, "fork", collate_fn=collate_kept)
-    assert torch.cat([b["index"] for b in batches]).tolist() == [i for i in range(12) if i not in corrupt]
-    assert sum(int(b["dhtorch.skipped"]) for b in batches) == 2 == skipping.report()["unreadable"]
-    flagging = transform(on_error="flag", other_image=None)
-    batches, _ = load_batches(ExtendedDataset(Frames(items, corrupt), flagging), 2, "fork")
-    rows = join_features(batches)
-    assert (rows["dhtorch.problem"] == SampleProblem.UNREADABLE).nonzero()[:, 0].tolist() == sorted(corrupt)
-    assert flagging.report() == {"none": 0, "no_second_view": 10, "no_depth": 0, "unreadable": 2}
-    assert batches[0]["image"].shape[1:] == (SIDE, SIDE, 3) and batches[1]["image"][1].sum() == 0
+def test_a_batch_is_its_samples_and_the_unpaired_get_the_sensor_alone(items, make, options, n):
+    samples = [{**items[i], "before": items[i - GAP]["image"]} for i in range(GAP, GAP + n)]
+    samples[1] = {**samples[1], "depth": (make is mapped) * samples[1]["depth"]}
+    pads = {1} if make is mapped else {2}
+    samples = [{"before_is_pad": torch.tensor([k in pads]), **s} for k, s in enumerate(samples)]
+    single, batched = make(**options), make(**options, batched=True)
+    together = added(batched(default_collate(samples)))
+    assert same(added(default_collate([single(s) for s in samples])), together)
+    counts = {"none": n - 1, "no_second_view": 1, "no_depth": 0, "unreadable": 0}
+    assert batched.report() == single.report() == counts | ({} if make is mapped else {"none": 4, "no_depth": 1})
+    if make is mapped:
+        assert (together["source_map"] == Source.SWEPT).flatten(1).any(1).tolist() == [True, False, True, True]
+        reference = SampleSpec(depth_unit="mm").read(items[GAP + 1]).reference
+        sensed = dense.sensor_depth_map(reference, method=MAP.replace(n=N), size=SIZE)
+        assert torch.equal(together["depth_map"][1], sensed.depth[0].nan_to_num())
+        assert torch.equal(together["gate_map"][1], sensed.gate[0])
 
 
 class Nested(Frames):
@@ -381,72 +269,125 @@ class Nested(Frames):
         return {**super().__getitem__(i), "episode": {"number": torch.tensor(i)}}
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("by_batch", [False, True])
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_what_is_added_leaves_a_worker_in_one_piece(items, in_process, by_batch, context):
-    extender = transform(index_key="index", seed=5, batched=by_batch or None)
-    dataset = ExtendedDataset(Nested(items), extender, gap=GAP, by_batch=by_batch, consumed=("depth",))
-    batches, _ = load_batches(dataset, 1, context, 4, collate_fn=dataset.collate)
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning", "ignore:.*pin_memory.*:UserWarning")
+@pytest.mark.parametrize(
+    ("workers", "context", "batch", "by_batch", "options"),
+    [
+        (0, None, 5, False, {}),
+        (2, "fork", 2, False, {"persistent_workers": True, "pin_memory": True}),
+        *(pytest.param(1, context, 4, True, {}, marks=pytest.mark.slow) for context in ("fork", "spawn")),
+        pytest.param(1, "spawn", 3, False, {}, marks=pytest.mark.slow),
+    ],
+)
+def test_workers_and_batch_size_change_nothing(items, workers, context, batch, by_batch, options):
+    here = ExtendedDataset(Frames(items), sparse(index_key="index", seed=5), gap=GAP)
+    wanted = join_features(load_batches(here, 0)[0])
+    extender = sparse(index_key="index", seed=5)
+    dataset = ExtendedDataset(Nested(items), extender, gap=GAP, by_batch=by_batch)
+    options = {**options, **({"collate_fn": dataset.collate} if by_batch else {})}
+    batches, loader = load_batches(dataset, workers, context, batch, **options)
     rows = join_features(batches)
-    assert [k for k, v in in_process.items() if not torch.equal(v, rows[k]) or v.dtype != rows[k].dtype] == []
-    for batch in batches:
-        ours = {k: x for k, x in batch.items() if k.startswith("dhtorch.")}
-        assert len(ours) == len(in_process) and len({x.untyped_storage().data_ptr() for x in ours.values()}) == 1
-        bounds = sorted((x.data_ptr(), x.numel() * x.element_size()) for x in ours.values())
-        assert all(a + size <= b for (a, size), (b, _) in pairwise(bounds)), "one lies over another"
-        assert all(x.is_contiguous() and x.data_ptr() % 8 == 0 for x in ours.values())
-        assert all(x.untyped_storage().data_ptr() != batch["image"].untyped_storage().data_ptr() for x in ours.values())
-        assert batch["episode"]["number"].tolist() == batch["index"].tolist() and "depth" not in batch
-    (own,) = load_batches(dataset, 0, None, 12, collate_fn=dataset.collate)[0]
-    mine = [x.untyped_storage().data_ptr() for k, x in own.items() if k.startswith("dhtorch.")]
-    assert len(set(mine)) == len(mine), "nothing is shared where nothing leaves the process"
+    assert same(wanted, rows) and all(not v.requires_grad and v.dtype == wanted[k].dtype for k, v in rows.items())
+    assert batches[0]["task"] == ["look around"] * batch and "before" not in batches[0]
+    assert batches[0]["episode"]["number"].tolist() == batches[0]["index"].tolist()
+    episodes = 2 if options.get("persistent_workers") else 1
+    if episodes == 2:
+        assert same(rows, join_features(list(loader)))
+    assert extender.report() == {"none": 3 * episodes, "no_second_view": 9 * episodes, "no_depth": 0, "unreadable": 0}
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_skipped_samples_leave_a_batch(items):
-    skipping = ExtendedDataset(Frames(items, {3, 8}), transform(on_error="skip", other_image=None))
-    batches, _ = load_batches(skipping, 2, "fork", 4, collate_fn=skipping.collate)
-    assert [b["dhtorch.skipped"].item() for b in batches] == [1, 0, 1]
-    rows = join_features(batches)
-    expected = [transform(other_image=None)(items[i]) for i in range(12) if i not in (3, 8)]
-    assert [k for k, x in rows.items() if not torch.equal(x, torch.stack([e[k] for e in expected]))] == []
+def test_maps_in_a_worker_are_the_same_also_where_an_item_is_corrupt(items):
+    options = {"on_error": "flag", "tokens_hw": (56, 56)}
+    here, there = (
+        join_features(load_batches(ExtendedDataset(Frames(items[: GAP + 2], {1}), mapped(**options), gap=GAP), *w)[0])
+        for w in ((0,), (1, "fork"))
+    )
+    assert same(here, there)
+    assert here["dhtorch.problem"].tolist() == [1, 3, 1, 1, 1, 1, 0, 3], "the last one's other view is corrupt"
+    flat = here["dhtorch.source_map"].flatten(1)
+    assert flat.any(1).tolist() == [k not in (1, 7) for k in range(8)] and (flat[GAP] == Source.SWEPT).any()
+    with pytest.raises(SampleError, match="no image gives the size of its maps"):
+        mapped(**options)({"depth": items[0]["depth"]})
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_a_whole_batch_skipped(items):
-    skipping = transform(on_error="skip", other_image=None)
-    batches, _ = load_batches(ExtendedDataset(Frames(items[:4], {0, 1}), skipping), 0, collate_fn=collate_kept)
-    assert batches[0] == {"dhtorch.skipped": 2} and batches[1]["dhtorch.depth"].shape == (2, N)
-    with pytest.raises(SampleError, match="neither item 0 nor its neighbours"):
-        ExtendedDataset(Frames(items[:2], {0, 1}), transform(on_error="flag"))[0]
-
-
-class Threads(Frames):
-    def __getitem__(self, i):
-        return {"torch": torch.get_num_threads(), "cv2": cv2.getNumThreads()}
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_one_thread_in_a_worker(items):
-    cv2.setNumThreads(2)
-    batches, _ = load_batches(Threads(items[:2]), 1, "fork")
-    assert batches[0]["torch"].tolist() == batches[0]["cv2"].tolist() == [1, 1] and cv2.getNumThreads() == 2
-    cv2.setNumThreads(1)
-
-
-def test_it_pickles_and_copies(sample):
-    one = transform(index_key="index", confidence=None)
+def test_it_pickles_and_copies_and_torch_compile_leaves_it_as_it_is(sample):
+    """torch.compile would trace for many minutes into a sample that Python reads; a model around it is compiled."""
+    one = sparse(index_key="index")
     first = one(sample)
     for twin in (pickle.loads(pickle.dumps(one)), copy.deepcopy(one)):
-        assert same(first, twin(sample)) and twin.report()["none"] == 2 and one.report()["none"] == 1
+        assert same(added(first), added(twin(sample))) and twin.report()["none"] == 2 and one.report()["none"] == 1
     buffer = io.BytesIO()
     torch.save(first, buffer)
     assert buffer.tell() < 4e5, "samples carry no more than they say"
+    for compiled in (torch.compile(one, backend="eager"), torch.compile(torch.nn.Sequential(one), backend="eager")):
+        assert same(added(compiled(sample)), added(first))
 
 
-# ---------------------------------------------------------------------------------------------------- tokens
+# ---------------------------------------------------------------------------------------------------------- dense maps
+
+
+def test_maps_and_tokens_are_those_of_the_dense_method(sample, pair):
+    out, plain = pair
+    assert out.keys() == plain.keys() | MAPS.keys()
+    assert [k for k in plain if not torch.equal(out[k], plain[k])] == ["tokens", "tokens_valid"]
+    read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
+    method = MAP.replace(n=N)
+    with torch.no_grad():
+        found = completion.complete_depth(
+            read.reference, read.other, method=method, calibration=completion.default_calibration(), **DENSE
+        )
+    swept = found.source == Source.SWEPT
+    assert swept.sum() > 500 and (~found.keep).sum() > 500, "or there is nothing to compare"
+    for key in ("depth", "sigma", "score", "source", "gate"):
+        expected = torch.where(found.keep | (key == "gate"), getattr(found, key), 0)[0]
+        assert torch.equal(out[f"{key}_map"], expected), key
+    uv = dense.map_pixel_centres(read.reference, (SIZE, SIZE))
+    hole = method.sample_depth_at(read.reference, uv).hole
+    every = MergedDepth(uv[None], *(out[f"{key}_map"].reshape(1, -1) for key in ("depth", "sigma", "score", "source")))
+    tokens, known = patch_tokens(every, hole, (SIDE, SIDE))
+    assert torch.equal(out["tokens"], tokens[0]) and torch.equal(out["tokens_valid"], known[0])
+
+
+def test_maps_and_tokens_learn_from_images_and_depth(sample):
+    tensors = {k: torch.from_numpy(sample[k].astype(np.float32)) for k in ("image", "before", "depth")}
+    leaves = {k: (v / 255 if k != "depth" else v).requires_grad_() for k, v in tensors.items()}
+    out = added(mapped()({**sample, **leaves}))
+    swept = out["source_map"] == Source.SWEPT
+    assert swept.sum() > 500
+    for total in (out["depth_map"][swept].log().sum(), out["tokens"].square().sum()):
+        for name, gradient in zip(
+            leaves, torch.autograd.grad(total, list(leaves.values()), retain_graph=True), strict=True
+        ):
+            assert gradient.isfinite().all() and gradient.any(), name
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"sise": 224}, "dense: found 'sise', expected some of source_views, planes, size, refinements, min_corr"),
+        ({"method": MAP}, "dense: found 'method', expected some of"),
+        ({"planes": 12.5}, "dense.planes: found 12.5, expected a whole number"),
+        ({"size": True}, "dense.size: found True, expected a whole number"),
+        ({"max_sigma_rel": "little"}, "dense.max_sigma_rel: found 'little', expected a number"),
+        ("yes", "dense: found 'yes', expected true, false or options among"),
+    ],
+)
+def test_options_of_maps_are_checked_when_it_is_made_and_default_to_those_of_the_function(wrong, words):
+    for name in ("dense", "extract.dense"):
+        with pytest.raises(ValueError, match=words.replace("dense", name, 1)):
+            DenseMaps.from_options(wrong, name)
+    with pytest.raises(ValueError, match=words):
+        mapped(dense=wrong)
+    standard = DenseMaps.from_options(True).options
+    assert standard == DenseMaps.from_options({}).options and DenseMaps.from_options(False) is None
+    parameters = signature(completion.complete_depth).parameters
+    assert {k: parameters[k].default for k in standard} == standard
+    changed = {"size": 224, "max_sigma_rel": 1}
+    assert DenseMaps.from_options(changed).options == {**standard, **changed}
+
+
+# ----------------------------------------------------------------------------------------------- tokens and validation
 
 
 @pytest.mark.slow
@@ -454,10 +395,8 @@ def test_tokens_stand_beside_dinov2_and_both_learn():
     transformers = pytest.importorskip("transformers")
     source = room()
     near = [torch.where(source[i].depth <= NEAR, source[i].depth, 0.0) for i in (0, GAP)]
-    config = transformers.Dinov2Config(
-        hidden_size=32, num_hidden_layers=1, num_attention_heads=2, patch_size=14, image_size=SIDE
-    )
-    network = transformers.Dinov2Model(config)
+    sizes = {"hidden_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 14, "image_size": SIDE}
+    network = transformers.Dinov2Model(transformers.Dinov2Config(**sizes))
     images = torch.cat([source[0].image, source[GAP].image]).float() / 255
     depth, images = torch.cat(near).requires_grad_(), images.requires_grad_()
     K = cam.to_matrix(source[0].camera).expand(2, 3, 3).clone().requires_grad_()
@@ -473,68 +412,28 @@ def test_tokens_stand_beside_dinov2_and_both_learn():
         assert x.grad.isfinite().all() and x.grad.abs().max() > 0, name
     assert all(p.grad is not None and p.grad.isfinite().all() for p in network.encoder.parameters())
     # What far tokens owe to the intrinsics comes through triangulation alone.
-    K.grad = None
-    out = extender(
-        {"image": images.detach(), "other": images.detach().flip(0), "depth": depth.detach(), "intrinsics": K}
-    )
+    K.grad, given = None, images.detach()
+    out = extender({"image": given, "other": given.flip(0), "depth": depth.detach(), "intrinsics": K})
     recovered = out["dhtorch.source"] == Source.RECOVERED
     assert recovered.sum() > 20
     out["dhtorch.depth"][recovered].sum().backward()
     assert K.grad.abs().max() > 0
 
 
-def test_what_a_verdict_does_not_know_is_0_and_said_to_be_unknown():
+def test_what_a_validation_does_not_know_is_0_and_marked_as_unknown(sample, monkeypatch):
     """A number is known with both its bounds; a map that is cut at 0 m is cut."""
     pixel, number, nan = torch.zeros(3, 1, 2), torch.tensor([[1.0, 0.9, 1.1]]).repeat(3, 1), float("nan")
     number[1, 2], number[2] = nan, nan
-    told = {"state": pixel.int(), "view": pixel.int(), "clip_depth": torch.tensor([0.0, 3.0, nan])}
-    told["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
-    told |= dict.fromkeys(("evidence", "sparse_evidence", "photometric_evidence", "consistency_evidence"), pixel)
-    told |= {"outline_evidence": pixel, "cause": pixel.int()}
+    fields = {"state": pixel.int(), "view": pixel.int(), "clip_depth": torch.tensor([0.0, 3.0, nan])}
+    fields["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
+    names = ("evidence", "sparse_evidence", "photometric_evidence", "consistency_evidence", "outline_evidence")
+    fields |= {**dict.fromkeys(names, pixel), "cause": pixel.int()}
     numbers = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
-    keys = validate_depth._validation_keys(DepthValidation(**told, **dict.fromkeys(numbers, number)))
+    verdict = DepthValidation(**fields, **dict.fromkeys(numbers, number))
+    monkeypatch.setattr(validate_depth, "validate_depth", lambda *_, **__: verdict)
+    keys = added(ValidateDepth(depth_unit="mm", batched=True)(default_collate([sample] * 3)))
     assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
-    for name in validate_depth._INTERVAL_KEYS:
+    for name in ("scale", "shift", "tilt", "wrong"):
         assert keys[f"{name}_known"].tolist() == [True, False, False] and keys[name].isfinite().all()
         assert torch.equal(keys[name][0], number[0]) and keys[name][2].tolist() == [0.0] * 3
     assert keys["clip_depth_known"].tolist() == [True, True, False] and keys["clip_depth"].tolist() == [0.0, 3.0, 0.0]
-
-
-@pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])
-@pytest.mark.parametrize(
-    "sample", [None, torch.zeros(3, 8, 8), "frame", [1, 2]], ids=["none", "tensor", "text", "list"]
-)
-def test_what_is_no_sample_is_named(transform, sample):
-    said = rf"sample: found {type(sample).__name__}.*, expected a dict with pictures and depth; image_transforms"
-    with pytest.raises(SampleError, match=said):
-        transform(depth_unit="m")(sample)
-
-
-def test_no_sample_is_skipped_but_cannot_be_flagged():
-    with pytest.warns(UserWarning, match="skipped: sample: found None"):
-        assert ExtendDepth(depth_unit="m", on_error="skip")(None) is None
-    with pytest.raises(SampleError, match="found NoneType"):
-        ExtendDepth(depth_unit="m", on_error="flag")(None)
-
-
-@pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])
-def test_a_transform_without_a_unit_says_which_there_are(transform):
-    with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\], metres per unit, or auto"):
-        transform()
-
-
-def test_one_return_that_no_probe_meets_is_a_return():
-    depth = torch.zeros(2, 60, 80)
-    depth[1, 31, 17] = 1.5
-    assert 2 * sample_spec._MAX_PROBES < 60 * 80
-    assert sample_spec._has_return(depth, sample_spec._probe_depth(depth)).tolist() == [False, True]
-    assert sample_spec._has_return(depth[1:] + 1, sample_spec._probe_depth(depth[1:] + 1)).tolist() == [True]
-
-
-def test_torch_compile_leaves_the_transform_as_it_is(sample):
-    """It would trace for many minutes into a sample that Python reads; a model around the transform is compiled."""
-    extend = transform()
-    model = torch.nn.Sequential(extend)
-    plain = extend(sample)
-    for compiled in (torch.compile(extend, backend="eager"), torch.compile(model, backend="eager")):
-        assert same(compiled(sample), plain)

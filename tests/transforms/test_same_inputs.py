@@ -1,6 +1,5 @@
 """One table of dtypes, channels and ranges: the same answer or the same message of Frame, Method and ExtendDepth."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -53,71 +52,58 @@ TABLE = [("image", *row) for row in IMAGES.items()] + [("depth", *row) for row i
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two views of the room: image (3, H, W) uint8, depth (h, w) m, intrinsics."""
+    """Two views of the room: images (3, H, W) uint8, depth (h, w) m, intrinsics."""
     room = SyntheticRoom(n_frames=7, hw=(96, 128), depth_hw=(96, 128), lidar="exact", supersample=1)
     frames = room[0], room[6]
-    bytes_of = [
-        f.image[0] if f.image.dtype == torch.uint8 else (255 * f.image[0]).round().to(torch.uint8) for f in frames
-    ]
+    images = [x if x.dtype == torch.uint8 else (255 * x).round().to(torch.uint8) for x in (f.image[0] for f in frames)]
     camera = frames[0].camera
-    return bytes_of, frames[0].depth[0], torch.cat((camera.f[0], camera.c[0]))
+    return *images, frames[0].depth[0], torch.cat((camera.f[0], camera.c[0]))
 
 
-def values_of(pair, field, change):
-    """The two images and the depth, one of them in another dtype."""
-    (first, second), depth, numbers = pair
-    if field == "image":
-        return change(first), change(second), depth, numbers
-    return first, second, change(depth), numbers
+def by_frames(run):
+    """Run of two Frames, with cameras of float32, for the values of a pair."""
+
+    def ask(first, second, depth, numbers):
+        camera = Camera(numbers[None, :2], numbers[None, 2:])
+        return run(Frame(first[None], depth[None], camera), Frame(second[None], depth[None], camera)).depth
+
+    return ask
 
 
-def frames_of(values):
-    """The values as Frames, with cameras of float32."""
-    first, second, depth, numbers = values
-    camera = Camera(numbers[None, :2], numbers[None, 2:])
-    return Frame(first[None], depth[None], camera), Frame(second[None], depth[None], camera)
-
-
-def by_method(values):
-    return PAPER.replace(n=N)(*frames_of(values)).depth
-
-
-def by_frame(values):
-    reference, other = frames_of(values)
-    return complete_depth(reference, [other], method=PAPER.replace(n=N), planes=16).depth
-
-
-def by_transform(values):
-    first, second, depth, numbers = values
+def by_transform(first, second, depth, numbers, unit="m"):
     sample = {"image": first, "before": second, "depth": depth, "intrinsics": numbers.numpy()}
-    out = ExtendDepth(method="paper", n=N, other_image="before", depth_unit="m", layout="chw")(sample)
+    out = ExtendDepth(method="paper", n=N, other_image="before", depth_unit=unit, layout="chw")(sample)
     assert (out["dhtorch.source"] != Source.NONE).any()
     return out["dhtorch.depth"]
 
 
-@pytest.mark.parametrize("ask", [by_method, by_frame, by_transform])
+ASK = {
+    "method": by_frames(PAPER.replace(n=N)),
+    "frame": by_frames(lambda a, b: complete_depth(a, [b], method=PAPER.replace(n=N), planes=16)),
+    "transform": by_transform,
+}
+
+
+@pytest.mark.parametrize("ask", ASK)
 @pytest.mark.parametrize(("field", "name", "row"), TABLE, ids=lambda x: x if isinstance(x, str) else "")
 def test_the_same_answer_or_message(pair, field, name, row, ask):
     change, message = row
-    values = values_of(pair, field, change)
+    first, second, depth, numbers = pair
+    values = (change(first), change(second), depth) if field == "image" else (first, second, change(depth))
     if message is None:
-        depth = ask(values)
+        depth = ASK[ask](*values, numbers)
         assert depth.is_floating_point() and bool((depth.nan_to_num() > 0).any())
         return
     with pytest.raises(ValueError) as refused:
-        ask(values)
+        ASK[ask](*values, numbers)
     text = str(refused.value)
     assert message in text and field in text and "\n" not in text, text
 
 
 def test_whole_numbers_of_a_stated_unit_are_read_alike(pair):
-    """Depth in mm of any integer dtype, with its unit, is that in metres; the method asks for metres."""
-    (first, second), depth, numbers = pair
-    mm = (1000 * depth).round()
-    found = []
-    for kind in (torch.uint16, torch.int16, torch.int32, torch.int64, torch.float32):
-        x = mm.int().to(kind)
-        sample = {"image": first, "before": second, "depth": x, "intrinsics": np.asarray(numbers)}
-        out = ExtendDepth(method="paper", n=N, other_image="before", depth_unit="mm", layout="chw")(sample)
-        found.append(out["dhtorch.depth"])
-    assert all(torch.equal(x, found[0]) for x in found)
+    """Depth in mm of any integer dtype, with its unit, is that in metres; the method requires metres."""
+    first, second, depth, numbers = pair
+    mm = (1000 * depth).round().int()
+    kinds = (torch.uint16, torch.int16, torch.int32, torch.int64, torch.float32)
+    answers = [by_transform(first, second, mm.to(kind), numbers, "mm") for kind in kinds]
+    assert all(torch.equal(x, answers[0]) for x in answers)

@@ -49,21 +49,6 @@ def pooled(found, hole, rows, columns, patch, place):
     return tokens, known
 
 
-def test_channels_are_depth_then_answers_then_holes():
-    assert TOKEN_CHANNELS == (
-        "inverse_depth",
-        "sigma",
-        "answered",
-        "hole_none",
-        "hole_trackable_no_lidar",
-        "hole_low_texture",
-        "hole_too_bright",
-        "hole_too_dark",
-        "hole_highlight",
-        "hole_at_border",
-    )
-
-
 @pytest.mark.parametrize(
     ("hw", "patch", "seen", "fit", "place"),
     [
@@ -84,48 +69,54 @@ def test_tokens_are_those_of_a_plain_loop(hw, patch, seen, fit, place):
     assert tokens.shape == (2, rows * columns, 10) and token_grid(hw, patch=patch, tokens_hw=seen) == (rows, columns)
     assert np.array_equal(known.numpy(), some) and some.any()
     np.testing.assert_allclose(tokens.numpy(), wanted, rtol=1e-9, atol=1e-12)
-    assert torch.allclose(tokens[..., 3:].sum(-1), (tokens[..., 3:].sum(-1) > 0).double()), "shares of holes sum to 1"
+    assert torch.allclose(tokens[..., 3:].sum(-1), (tokens[..., 3:].sum(-1) > 0).double()), "fractions sum to 1"
+    names_of = ("none", "trackable_no_lidar", "low_texture", "too_bright", "too_dark", "highlight", "at_border")
+    assert ("inverse_depth", "sigma", "answered", *(f"hole_{name}" for name in names_of)) == TOKEN_CHANNELS
 
 
-def told(uv, depth, sigma=0.0, source=1):
-    uv = torch.tensor([uv], dtype=torch.float64)
-    depth = torch.tensor([depth], dtype=torch.float64)
-    return MergedDepth(uv, depth, depth * 0 + sigma, depth, torch.full(depth.shape, source, dtype=torch.int32))
+def tokens_of(uv, depth, sigma=0.0, source=1, hole=None, hw=(10, 10)):
+    """Tokens of one image of patches of 10 px, and which are known."""
+    uv, depth = torch.tensor([uv], dtype=torch.float64), torch.tensor([depth], dtype=torch.float64)
+    source = torch.tensor(source, dtype=torch.int32).expand(depth.shape)
+    hole = torch.zeros(depth.shape) if hole is None else torch.tensor([hole])
+    tokens, known = patch_tokens(MergedDepth(uv, depth, depth * 0 + sigma, depth, source), hole, hw, patch=10)
+    return tokens[0], known[0]
 
 
-def test_patches_go_row_by_row_and_a_pixel_on_the_edge_is_in_the_later_one():
-    hw, patch = (20, 30), 10  # two rows of three
-    for (u, v), place in {
-        (0, 0): 0, (10, 0): 1, (29, 9): 2, (0, 10): 3, (29, 19): 5, (9.49, 0): 0, (9.5, 0): 1, (0, 9.49): 0, (0, 9.5): 3,
-        (-0.5, -0.5): 0, (29.49, 19.49): 5,
-    }.items():  # fmt: skip
-        tokens, known = patch_tokens(told([(u, v)], [2.0]), torch.zeros(1, 1), hw, patch=patch)
-        assert known[0].nonzero().tolist() == [[place]] and tokens[0, place, 0] == 0.5, (u, v)
-    for outside in ((-0.51, 5), (29.5, 5), (5, -0.51), (5, 19.5)):
-        tokens, known = patch_tokens(told([outside], [2.0]), torch.zeros(1, 1), hw, patch=patch)
-        assert not known.any() and not tokens.any(), outside
+@pytest.mark.parametrize(
+    ("uv", "place"),
+    [
+        *(((0, 0), 0), ((10, 0), 1), ((29, 9), 2), ((0, 10), 3), ((29, 19), 5), ((9.49, 0), 0), ((9.5, 0), 1)),
+        *(((0, 9.49), 0), ((0, 9.5), 3), ((-0.5, -0.5), 0), ((29.49, 19.49), 5)),
+        *((uv, None) for uv in ((-0.51, 5), (29.5, 5), (5, -0.51), (5, 19.5))),
+    ],
+)
+def test_patches_go_row_by_row_and_a_pixel_on_the_edge_is_in_the_later_one(uv, place):
+    tokens, known = tokens_of([uv], [2.0], hw=(20, 30))  # two rows of three
+    assert known.nonzero().tolist() == ([] if place is None else [[place]])
+    assert tokens[:, 0].tolist() == [0.5 * (k == place) for k in range(6)]
 
 
-def test_sigma_is_noise_and_spread_of_inverse_depth():
-    one = told([(3, 3)], [2.0], 0.4)
-    assert patch_tokens(one, torch.zeros(1, 1), (10, 10), patch=10)[0][0, 0, 1] == pytest.approx(0.1)
-    two = told([(3, 3), (6, 6)], [1.0, 2.0], 0.0)
-    tokens, _ = patch_tokens(two, torch.zeros(1, 2), (10, 10), patch=10)
-    assert tokens[0, 0, :3].tolist() == pytest.approx([0.75, 0.25, 1.0])
-    calm = told([(3, 3), (6, 6)], [2.0, 2.0], 0.0)
-    assert patch_tokens(calm, torch.zeros(1, 2), (10, 10), patch=10)[0][0, 0, 1] == 0
+UV = [(2, 2), (4, 4), (6, 6), (8, 8)]
 
 
-def test_what_has_no_source_or_no_depth_is_no_answer():
-    uv = [(2, 2), (4, 4), (6, 6), (8, 8)]
-    found = told(uv, [1.0, 2.0, 0.0, 5.0], 0.1)
-    found = found.replace(source=torch.tensor([[1, 2, 1, 0]], dtype=torch.int32))
-    tokens, known = patch_tokens(found, torch.tensor([[0, 1, 2, 6]]), (10, 10), patch=10)
-    assert tokens[0, 0, [0, 2]].tolist() == pytest.approx([0.75, 0.5]) and known.all()
-    assert tokens[0, 0, 3:].tolist() == pytest.approx([0.25, 0.25, 0.25, 0, 0, 0, 0.25])
-    silent = found.replace(source=found.source * 0)
-    tokens, known = patch_tokens(silent, torch.tensor([[3, 3, 3, 3]]), (10, 10), patch=10)
-    assert not known.any() and tokens[0, 0].tolist() == [0, 0, 0, 0, 0, 0, 1, 0, 0, 0]
+@pytest.mark.parametrize(
+    ("samples", "wanted"),
+    [
+        ((UV[:1], [2.0], 0.4), [0.5, 0.1, 1.0]),  # noise: d(1/z) = dz / z²
+        ((UV[:2], [1.0, 2.0]), [0.75, 0.25, 1.0]),  # spread
+        ((UV[:2], [2.0, 2.0]), [0.5, 0.0, 1.0]),
+        # What has no source or no depth is no answer.
+        (
+            (UV, [1.0, 2.0, 0.0, 5.0], 0.0, [1, 2, 1, 0], [0, 1, 2, 6]),
+            [0.75, 0.25, 0.5, 0.25, 0.25, 0.25, 0, 0, 0, 0.25],
+        ),
+        ((UV, [1.0, 2.0, 0.0, 5.0], 0.1, 0, [3, 3, 3, 3]), [0, 0, 0, 0, 0, 0, 1, 0, 0, 0]),
+    ],
+)
+def test_a_token_by_hand(samples, wanted):
+    tokens, known = tokens_of(*samples)
+    assert tokens[0, : len(wanted)].tolist() == pytest.approx(wanted) and bool(known[0]) == (wanted[2] > 0)
 
 
 def test_gradient_of_tokens_against_finite_differences():
@@ -137,16 +128,12 @@ def test_gradient_of_tokens_against_finite_differences():
 
     depth = found.score.clone().requires_grad_()
     assert torch.autograd.gradcheck(of, (depth, found.sigma.clone().requires_grad_()))
-    flat = torch.ones(1, 3, dtype=torch.float64, requires_grad=True)
-    same = told([(2, 2), (5, 5), (7, 7)], [1.0, 1.0, 1.0]).replace(depth=flat)
-    patch_tokens(same, torch.zeros(1, 3), (10, 10), patch=10)[0].sum().backward()
+    flat = torch.ones(1, 3, requires_grad=True)
+    same = MergedDepth(torch.full((1, 3, 2), 4.0), flat, 0 * flat.detach(), flat, torch.ones(1, 3, dtype=torch.int32))
+    tokens = patch_tokens(same, torch.zeros(1, 3), (10, 10), patch=10)[0]
+    tokens.sum().backward()
     assert flat.grad.isfinite().all(), "no spread and no noise: the root has no slope, the tokens have"
-
-
-def test_tokens_have_the_type_of_the_depth():
-    for dtype in (torch.float32, torch.float64):
-        found, hole = drawn((20, 20), dtype=dtype)
-        assert patch_tokens(found, hole, (20, 20), patch=10)[0].dtype == dtype
+    assert tokens.dtype == torch.float32, "the type of the depth"
 
 
 @pytest.mark.parametrize("fit", ["stretch", "pad", "crop"])
@@ -171,24 +158,24 @@ def test_tokens_lie_where_the_network_sees_them(fit):
     assert torch.allclose(got[known[0]], wanted[known[0]], rtol=0.05)
 
 
-def test_tokens_refuse_what_cannot_be():
-    found = MergedDepth(*(torch.zeros(1, 0, 2), *torch.zeros(3, 1, 0), torch.zeros(1, 0, dtype=torch.int32)))
-    tokens, known = patch_tokens(found, torch.zeros(1, 0), (28, 28))
+NOTHING = MergedDepth(*(torch.zeros(1, 0, 2), *torch.zeros(3, 1, 0), torch.zeros(1, 0, dtype=torch.int32)))
+
+
+@pytest.mark.parametrize(
+    ("hw", "options", "hole", "words"),
+    [
+        ((10, 28), {}, (1, 0), "found an image of 10x28, expected at least one patch of 14 px"),
+        ((28, 28), {"fit": "squash"}, (1, 0), "fit is 'squash', expected one of stretch, pad, crop"),
+        *(((28, 28), {}, hole, "patch_tokens") for hole in ((2, 0), (1, 1), (1, 0, 1))),
+        *(((40, 40), {"patch": k}, (1, 0), f"expected at least one patch of {k} px") for k in (0, -1)),
+        ((40, 13), {}, (1, 0), "found an image of 40x13"),
+        ((400, 400), {"tokens_hw": (9, 50)}, (1, 0), "found an image of 9x50"),
+    ],
+)
+def test_tokens_refuse_what_cannot_be(hw, options, hole, words):
+    with pytest.raises(ValueError, match=words):
+        patch_tokens(NOTHING, torch.zeros(hole), hw, **options)
+    tokens, known = patch_tokens(NOTHING, torch.zeros(1, 0), (28, 28))
     assert tokens.shape == (1, 4, 10) and not known.any() and (tokens == 0).all()
-    with pytest.raises(ValueError, match="found an image of 10x28, expected at least one patch of 14 px"):
-        patch_tokens(found, torch.zeros(1, 0), (10, 28))
-    with pytest.raises(ValueError, match="fit is 'squash', expected one of stretch, pad, crop"):
-        patch_tokens(found, torch.zeros(1, 0), (28, 28), fit="squash")
-    for wrong in (torch.zeros(2, 0), torch.zeros(1, 1), torch.zeros(1, 0, 1)):
-        with pytest.raises(ValueError, match="patch_tokens"):
-            patch_tokens(found, wrong, (28, 28))
-
-
-def test_a_grid_counts_whole_patches():
     assert token_grid((28, 43)) == (2, 3) and token_grid((480, 640), patch=16, tokens_hw=(31, 64)) == (1, 4)
     assert token_grid((14, 14)) == (1, 1) and token_grid((3, 3), patch=3, tokens_hw=(5, 3)) == (1, 1)
-    for hw, patch in (((13, 40), 14), ((40, 13), 14), ((40, 40), 0), ((40, 40), -1)):
-        with pytest.raises(ValueError, match=f"found an image of {hw[0]}x{hw[1]}, expected .* patch of {patch} px"):
-            token_grid(hw, patch=patch)
-    with pytest.raises(ValueError, match="found an image of 9x50"):
-        token_grid((400, 400), tokens_hw=(9, 50))
