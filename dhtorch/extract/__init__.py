@@ -27,7 +27,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
-from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
+from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.transforms import TOKEN_CHANNELS, DenseMaps, schema, token_grid
 from dhtorch.transforms.extend_depth import ON_ERROR_CHOICES
 from dhtorch.transforms.tokens import FIT_MODES
@@ -36,12 +36,6 @@ __all__ = ["ExtractOptions", "FeatureTable", "JoinedDataset", "run"]
 
 #: Version of the file format, increased by every change that an older reader would misread.
 _FORMAT_VERSION = 1
-
-#: ExtractOptions that change where and how fast rows are computed, but not the rows.
-_OPTIONS_NOT_IN_KEY = ("engine", "address")
-
-#: Maximum number of unreadable frames that the summary names.
-_MAX_COMPLAINTS_SHOWN = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,39 +93,30 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     rows = _make_rows(scenes, extraction_plan, parts["method"], settings["seed"], options)
     folder = Path(str(settings["out"])).expanduser()
     with open_output_folder(folder, "out") as output:
-        return _write_shards(settings, options, extraction_plan, rows, output, progress)
-
-
-def _write_shards(
-    settings: Mapping[str, Any],
-    options: ExtractOptions,
-    extraction_plan: plan.ExtractionPlan,
-    rows: RowDataset,
-    output: OutputFolder,
-    progress: Callable[..., Iterable[Any]],
-) -> int:
-    """Compute and write the missing shards; returns the exit code."""
-    folder, shared = output.path, _shared_metadata(settings, options, extraction_plan, rows)
-    all_shards = extraction_plan.shards(options.shard_rows)
-    done = shards.find_finished_shards(folder, shared)
-    if output.is_unlisted:  # of an older version
-        output.adopt(folder / name for name in done)
-    todo = [shard for shard in all_shards if shard.name not in done]
-    output.check(folder / shard.name for shard in todo)
-    counts = dict(done)
-    positions = [position for shard in todo for position in shard.rows]
-    complaints: list[str] = []
-    engine = engines.run_engine(options.engine, rows, positions, workers=settings["workers"], address=options.address)
-    try:
-        with closing(progress(engine, format_count(len(extraction_plan), "frame"), len(positions))) as answers:  # type: ignore[type-var]
-            for shard in todo:
-                kept = engines.filter_rows(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
-                counts[shard.name] = shards.write_shard(folder, shard, kept, rows.wanted, shared)
-    except KeyboardInterrupt:
-        finished = f"{len(counts)} of {format_count(len(all_shards), 'shard')} in {folder} are complete and stay"
-        raise KeyboardInterrupt(f"{finished}; run the same command again for the rest") from None
-    _print_summary(folder, counts, len(done), complaints)
-    return 0
+        folder, shared = output.path, _shared_metadata(settings, options, extraction_plan, rows)
+        all_shards = extraction_plan.shards(options.shard_rows)
+        done = shards.find_finished_shards(folder, shared)
+        if output.is_unlisted:  # of an older version
+            output.adopt(folder / name for name in done)
+        todo = [shard for shard in all_shards if shard.name not in done]
+        output.check(folder / shard.name for shard in todo)
+        counts = dict(done)
+        positions = [position for shard in todo for position in shard.rows]
+        complaints: list[str] = []
+        engine = engines.run_engine(
+            options.engine, rows, positions, workers=settings["workers"], address=options.address
+        )
+        shown = progress(engine, format_count(len(extraction_plan), "frame"), len(positions))
+        try:
+            with closing(shown) as answers:  # type: ignore[type-var]
+                for shard in todo:
+                    kept = engines.filter_rows(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
+                    counts[shard.name] = shards.write_shard(folder, shard, kept, rows.wanted, shared)
+        except KeyboardInterrupt:
+            finished = f"{len(counts)} of {format_count(len(all_shards), 'shard')} in {folder} are complete and stay"
+            raise KeyboardInterrupt(f"{finished}; run the same command again for the rest") from None
+        _print_summary(folder, counts, len(done), complaints)
+        return 0
 
 
 def _make_rows(
@@ -140,8 +125,15 @@ def _make_rows(
     """Scenes, plan and options -> data set of rows with the selected columns."""
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
     token_rows, token_columns = token_grid(hw, patch=options.patch, tokens_hw=hw)
+    # Height and width of the maps; None if no column holds one. Maps require images of one size
+    maps = DenseMaps.from_options(options.dense, "extract.dense")
+    dense = {spec.key for spec in schema.COLUMNS if spec.option == "dense"}
+    has_map_column = options.columns is None or not dense.isdisjoint(options.columns)
     all_columns = columns.feature_columns(
-        method.n, token_rows * token_columns, half=options.half, map_hw=_map_hw(scenes, options)
+        method.n,
+        token_rows * token_columns,
+        half=options.half,
+        map_hw=common_map_hw(scenes, maps) if maps is not None and has_map_column else None,
     )
     return RowDataset(
         scenes,
@@ -157,19 +149,12 @@ def _make_rows(
     )
 
 
-def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int] | None:
-    """Height and width of the maps; None if no column holds one. Maps require images of one size."""
-    maps = DenseMaps.from_options(options.dense, "extract.dense")
-    dense = {spec.key for spec in schema.COLUMNS if spec.option == "dense"}
-    has_map_column = options.columns is None or not dense.isdisjoint(options.columns)
-    return common_map_hw(scenes, maps) if maps is not None and has_map_column else None
-
-
 def _shared_metadata(
     settings: Mapping[str, Any], options: ExtractOptions, extraction_plan: plan.ExtractionPlan, rows: RowDataset
 ) -> dict[str, Any]:
     """Metadata shared by all shards: meaning of the columns, settings, data, versions and key."""
-    key_options = {k: v for k, v in asdict(options).items() if k not in _OPTIONS_NOT_IN_KEY}
+    # The others change where and how fast rows are computed, but not the rows.
+    key_options = {k: v for k, v in asdict(options).items() if k not in ("engine", "address")}
     config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": key_options}
     files = {**result_files.list_files_below(extraction_plan.roots.items()), **result_files.list_files_named(config)}
     name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
@@ -215,7 +200,7 @@ def _print_summary(folder: Path, counts: Mapping[str, Counter[str]], n_before: i
     ]
     if problems:
         print(f"frames with a problem: {', '.join(problems)}")
-    for complaint in complaints[:_MAX_COMPLAINTS_SHOWN]:
+    for complaint in complaints[:3]:
         print(f"  {complaint}")
-    if len(complaints) > _MAX_COMPLAINTS_SHOWN:
-        print(f"  and {len(complaints) - _MAX_COMPLAINTS_SHOWN} more")
+    if len(complaints) > 3:
+        print(f"  and {len(complaints) - 3} more")

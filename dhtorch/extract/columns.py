@@ -20,8 +20,8 @@ Row = dict[str, Any]  # column → number, text or array
 #: Columns that identify a row: they come first, and every shard has them.
 KEY_COLUMNS = ("episode_index", "frame_index", "timestamp", "recording")
 
-#: Kinds other than numbers → estimated bytes of a value.
-_GUESSED_BYTES = {"str": 1, "bytes": 1 << 18}
+#: Kinds other than numbers → estimated bytes of a value, and the blank one.
+_OTHER_KINDS: dict[str, tuple[int, Any]] = {"str": (1, ""), "bytes": (1 << 18, b"")}
 
 
 class Column(NamedTuple):
@@ -35,7 +35,9 @@ class Column(NamedTuple):
     @property
     def n_bytes(self) -> int:
         """Bytes in memory of one row; files and texts are estimated."""
-        return _GUESSED_BYTES.get(self.kind) or np.dtype(self.kind).itemsize * math.prod(self.shape)
+        if self.kind in _OTHER_KINDS:
+            return _OTHER_KINDS[self.kind][0]
+        return np.dtype(self.kind).itemsize * math.prod(self.shape)
 
 
 def feature_columns(
@@ -74,10 +76,12 @@ def select_columns(available: Mapping[str, Column], wanted: Sequence[str] | None
 
 def blank_features(wanted: Mapping[str, Column]) -> Row:
     """Columns -> features of an unreadable frame: zeros, and ``problem`` UNREADABLE."""
-    empty: dict[str, Any] = {"str": "", "bytes": b""}
-    zeros = {k: empty[c.kind] if c.kind in empty else np.zeros(c.shape, c.kind) for k, c in wanted.items()}
-    zeros = {k: value for k, value in zeros.items() if k not in KEY_COLUMNS}
-    return {**zeros, "problem": np.asarray(SampleProblem.UNREADABLE, wanted["problem"].kind)}
+    blank = {
+        k: _OTHER_KINDS[c.kind][1] if c.kind in _OTHER_KINDS else np.zeros(c.shape, c.kind)
+        for k, c in wanted.items()
+        if k not in KEY_COLUMNS
+    }
+    return {**blank, "problem": np.asarray(SampleProblem.UNREADABLE, wanted["problem"].kind)}
 
 
 def code_tables() -> dict[str, dict[int, str]]:
@@ -101,7 +105,7 @@ def arrow_table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) 
     rows = list(rows)
     arrays = []
     for name, column in wanted.items():
-        if column.kind in _GUESSED_BYTES:
+        if column.kind in _OTHER_KINDS:
             arrays.append(pyarrow.array([row[name] for row in rows], _arrow_type(pyarrow, column)))
             continue
         values = np.stack([np.asarray(row[name]).astype(column.kind) for row in rows])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,15 +20,11 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.view_report import with_view_selection
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 from dhtorch.transforms import DenseMaps, ExtendDepth, SampleError
 
 #: Readers return metres and the camera of the same pixels: the checks of unit and intrinsics are switched off.
 _READER_OPTIONS = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "min_focal": 0.0}
-
-
-#: Maximum bytes of cached frames, which are read again as source views of later frames.
-_FRAME_CACHE_BYTES = 1 << 26
 
 
 class ExtractedRow(NamedTuple):
@@ -101,7 +97,12 @@ class RowDataset(Dataset[ExtractedRow]):
         """Frame ``i`` of an opened recording -> its columns other than the key columns."""
         reference = opened.frame(i)
         added = opened.answer(reference, opened.others(i))
-        _check_shapes(added, self.wanted)
+        for name, column in self.wanted.items():  # only maps depend on the image size
+            if name in added and tuple(added[name].shape) != column.shape:
+                actual, expected = (format_hw(shape) for shape in (added[name].shape, column.shape))
+                raise SampleError(
+                    f"{name}: found {actual}, expected {expected} as of the first frame; extract it apart"
+                )
         columns = {k: c for k, c in self.wanted.items() if k not in KEY_COLUMNS}
         return {k: added[k].numpy().astype(c.kind) for k, c in columns.items()}
 
@@ -138,11 +139,36 @@ class OpenRecording:
 
     def answer(self, reference: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
         """Reference frame and source frames -> columns that the transform adds to their sample, without prefix."""
-        sample = _make_sample(reference, others)
+        # A sample of frames along time, the reference view last.
+        frames = [*(reference if other is None else other for other in others), reference]
+        cameras = [frame.camera for frame in frames]
+        sample = {
+            "image": torch.cat([frame.image for frame in frames]),
+            "image_is_pad": torch.tensor([*(other is None for other in others), False]),
+            "depth": reference.depth,
+            "intrinsics": torch.cat([cam.to_matrix(camera) for camera in cameras]),
+        }
+        if reference.conf is not None:
+            sample["confidence"] = reference.conf
+        lenses = [camera.distortion for camera in cameras if camera.distortion is not None]
+        if lenses:
+            size = max(lens.shape[-1] for lens in lenses)
+            none = lenses[0].new_zeros(1, 0)
+            padded = (none if camera.distortion is None else camera.distortion for camera in cameras)
+            sample["distortion"] = torch.cat([torch.nn.functional.pad(x, (0, size - x.shape[-1])) for x in padded])
+        if reference.depth_camera is not None:
+            sample["depth_intrinsics"] = cam.to_matrix(reference.depth_camera)[0]
+        poses = [frame.T_world_from_cam for frame in frames]
+        if all(pose is not None for pose in poses):
+            sample["pose"] = torch.cat([se3.to_matrix(pose) for pose in poses if pose is not None])
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         sample_kind = (len(sample["image"]), *optional)
         if sample_kind not in self.transforms:
-            self.transforms[sample_kind] = self._transform(len(sample["image"]) - 1, optional)
+            views = len(sample["image"]) - 1
+            options: dict[str, Any] = {**_READER_OPTIONS, **self.options, **{key: key for key in optional}}
+            options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
+            other_at = list(range(views)) if views > 1 else 0
+            self.transforms[sample_kind] = ExtendDepth(method=self.method, other_at=other_at, **options)
         transform = self.transforms[sample_kind]
         extended = transform(sample)
         assert extended is not None  # on_error is raise
@@ -170,15 +196,8 @@ class OpenRecording:
         """Drop the oldest frames beyond the cache size. (Uncached, decoding backwards restarts at a key frame.)"""
         frames = [frame for frame in self.cached.values() if frame is not None]
         size = max((frame.image.nbytes + frame.depth.nbytes for frame in frames), default=1)
-        while len(self.cached) > max(2, _FRAME_CACHE_BYTES // size):
+        while len(self.cached) > max(2, (1 << 26) // size):  # 64 MB: they are source views of later frames
             self.cached.popitem(last=False)
-
-    def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
-        """Number of source views and optional keys of a sample -> its transform."""
-        options: dict[str, Any] = {**_READER_OPTIONS, **self.options, **{key: key for key in optional}}
-        options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
-        other_at = list(range(views)) if views > 1 else 0
-        return ExtendDepth(method=self.method, other_at=other_at, **options)
 
 
 def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
@@ -195,9 +214,9 @@ def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
             continue  # reported row by row
         hw = maps.hw(frame.hw)
         if first is not None and hw != first[1]:
-            actual = f"{recording.name} has pictures of {_format_hw(frame.hw)} and maps of {_format_hw(hw)}"
+            actual = f"{recording.name} has pictures of {format_hw(frame.hw)} and maps of {format_hw(hw)}"
             raise ValueError(
-                f"extract.dense: {actual}, expected maps of {_format_hw(first[1])} as of {first[0]}; extract them apart"
+                f"extract.dense: {actual}, expected maps of {format_hw(first[1])} as of {first[0]}; extract them apart"
             )
         first = first or (recording.name, hw)
     if first is None:
@@ -215,43 +234,6 @@ def try_read_frame(recording: Recording, at: int) -> Frame | None:
         return None
 
 
-def _check_shapes(added: Mapping[str, Tensor], wanted: Mapping[str, Column]) -> None:
-    """Raises SampleError for a map of another size than its column: only maps depend on the image size."""
-    for name, column in wanted.items():
-        if name in added and tuple(added[name].shape) != column.shape:
-            actual, expected = (_format_hw(shape) for shape in (added[name].shape, column.shape))
-            raise SampleError(f"{name}: found {actual}, expected {expected} as of the first frame; extract it apart")
-
-
-def _format_hw(hw: Sequence[int]) -> str:
+def format_hw(hw: Sequence[int]) -> str:
+    """Height and width as text."""
     return f"{hw[0]}x{hw[1]}"
-
-
-def _make_sample(reference: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
-    """Reference frame and source frames -> sample dict, frames along time, the reference view last."""
-    frames = [*(reference if other is None else other for other in others), reference]
-    cameras = [frame.camera for frame in frames]
-    sample = {
-        "image": torch.cat([frame.image for frame in frames]),
-        "image_is_pad": torch.tensor([*(other is None for other in others), False]),
-        "depth": reference.depth,
-        "intrinsics": torch.cat([cam.to_matrix(camera) for camera in cameras]),
-    }
-    if reference.conf is not None:
-        sample["confidence"] = reference.conf
-    lenses = [camera.distortion for camera in cameras if camera.distortion is not None]
-    if lenses:
-        size = max(lens.shape[-1] for lens in lenses)
-        sample["distortion"] = torch.cat([_pad_distortion(camera, lenses[0], size) for camera in cameras])
-    if reference.depth_camera is not None:
-        sample["depth_intrinsics"] = cam.to_matrix(reference.depth_camera)[0]
-    poses = [frame.T_world_from_cam for frame in frames]
-    if all(pose is not None for pose in poses):
-        sample["pose"] = torch.cat([se3.to_matrix(pose) for pose in poses if pose is not None])
-    return sample
-
-
-def _pad_distortion(camera: Camera, like: Tensor, size: int) -> Tensor:
-    """Distortion coefficients (1, size) of a camera, padded with zeros."""
-    coefficients = like.new_zeros(1, 0) if camera.distortion is None else camera.distortion
-    return torch.nn.functional.pad(coefficients, (0, size - coefficients.shape[-1]))

@@ -21,16 +21,6 @@ from dhtorch.extract.dataset import ExtractedRow, RowDataset
 from dhtorch.runtime.parent_watch import exit_with_parent
 from dhtorch.transforms import SampleError, one_thread
 
-#: Rows of one Ray task: the unit that is repeated if a node is lost.
-_RAY_TASK_ROWS = 16
-
-#: Shared memory of a Ray instance started on this machine, bytes.
-_RAY_STORE_BYTES = 300_000_000
-
-#: Timeout of the connection to a cluster, s.
-_CONNECT_TIMEOUT_S = 10
-
-
 #: Names of the engines.
 ENGINES = ("local", "ray")
 
@@ -99,8 +89,13 @@ def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> 
         ConnectionError: no cluster at the address.
     """
     ray, data = import_optional("ray", extra="scale"), import_optional("ray.data", extra="scale")
-    _check_reachable(address)
-    init_args = {} if address else {"include_dashboard": False, "object_store_memory": _RAY_STORE_BYTES}
+    host, _, port = str(address).removeprefix("ray://").rpartition(":")
+    if port.isdigit():  # Ray itself retries for minutes
+        try:
+            socket.create_connection((host, int(port)), timeout=10).close()
+        except OSError as error:
+            raise ConnectionError(f"address: no connection to {address} ({error}), expected a Ray cluster") from None
+    init_args = {} if address else {"include_dashboard": False, "object_store_memory": 300_000_000}
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **init_args)
@@ -111,8 +106,8 @@ def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> 
         context.execution_options.preserve_order = True
         context.enable_progress_bars = False
         shared = ray.put(rows)
-        splits = range(_RAY_TASK_ROWS, len(positions), _RAY_TASK_ROWS)
-        blocks = np.split(np.asarray(positions, np.int64), splits)
+        # A task of 16 rows is repeated if a node is lost.
+        blocks = np.split(np.asarray(positions, np.int64), range(16, len(positions), 16))
 
         def task(batch: dict[str, Any]) -> dict[str, Any]:
             return {
@@ -124,17 +119,6 @@ def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> 
             yield from map(pickle.loads, block["answer"])
     finally:
         ray.shutdown()
-
-
-def _check_reachable(address: str | None) -> None:
-    """Raises ConnectionError if no server accepts connections at the address; Ray itself retries for minutes."""
-    host, _, port = str(address).removeprefix("ray://").rpartition(":")
-    if not port.isdigit():
-        return
-    try:
-        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
-    except OSError as error:
-        raise ConnectionError(f"address: no connection to {address} ({error}), expected a Ray cluster") from None
 
 
 def _init_worker(number: int) -> None:

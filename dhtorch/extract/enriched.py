@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,8 +19,8 @@ from dhtorch.data.scene import Scene
 from dhtorch.export import encode_png
 from dhtorch.export.lerobot import N_BINS, FeatureMoments, LogHistogram
 from dhtorch.export.tiff import encode_float_tiff
-from dhtorch.extract.columns import KEY_COLUMNS, Column, Row, stored_column
-from dhtorch.extract.dataset import OpenRecording, RowDataset, try_read_frame
+from dhtorch.extract.columns import Column, Row, stored_column
+from dhtorch.extract.dataset import OpenRecording, RowDataset, format_hw, try_read_frame
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline import dense
@@ -47,9 +47,6 @@ NO_OTHER_VIEW = max(names(Gate)) + 1
 
 #: Reasons for unanswered pixels, by code: gates, and no source view.
 NO_ANSWER_REASONS = {**names(Gate), NO_OTHER_VIEW: "NO_OTHER_VIEW"}
-
-#: Shape of the stored :class:`dhtorch.export.lerobot.FeatureMoments`: numbers × (depth, sigma, red, green, blue).
-_MOMENTS_SHAPE = (5, 5)
 
 
 @dataclass(frozen=True)
@@ -107,15 +104,11 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
     """Columns of the intermediate shards; ``pictures``: with the encoded image; ``n``: samples of a frame."""
     f, whole = "float64", "int64"
     files = {name: f"{c.meaning}, {c.unit}, as {str(c.enrich).upper()}" for name, c in MAP_FILES.items()}
-    place = {
+    return {
         "episode_index": Column(whole, (), "1", "number of the episode"),
         "frame_index": Column(whole, (), "1", "number of the frame in its capture"),
         "timestamp": Column(f, (), "s", "NaN = none"),
         "recording": Column("str", (), "1", "name of the recording"),
-    }
-    assert tuple(place) == KEY_COLUMNS
-    return {
-        **place,
         **{name: Column("bytes", (), "file", about) for name, about in files.items()},
         **{key: number_column(c, n) for key, c in NUMBER_COLUMNS.items()},
         **({"picture": Column("bytes", (), "file", "the picture as PNG")} if pictures else {}),
@@ -124,7 +117,7 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
         "no_answer": Column(whole, (len(NO_ANSWER_REASONS),), "1", "unanswered ones by NO_ANSWER_REASONS"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
-        "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
+        "moments": Column(f, (5, 5), "m, 1", "of depth, sigma, red, green, blue"),
         "ranges": Column("int32", (3, N_BINS), "1", "answered pixels by depth, sigma; recovered by sigma / depth"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
@@ -156,7 +149,7 @@ class MapRowDataset(RowDataset):
         view = self.views[camera_key(recording)]
         if reference.hw != view.hw:
             raise SampleError(
-                f"image: found {_format_hw(reference.hw)}, expected {_format_hw(view.hw)} as of the first frame"
+                f"image: found {format_hw(reference.hw)}, expected {format_hw(view.hw)} as of the first frame"
             )
         if get_distortion(reference) != view.lens:
             expected = list(view.lens) or "none"
@@ -171,10 +164,20 @@ class MapRowDataset(RowDataset):
         reason = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
         for name in maps:
             if MAP_FILES[name].enrich == "tiff":
-                maps[name] = _quantise(maps[name], self.step / MAP_STEPS.get(name, 1))
+                step, x = self.step / MAP_STEPS.get(name, 1), maps[name].astype(np.float64)
+                # At least one step where positive; 0 = unquantised.
+                x = np.where(x > 0, np.rint(x / step).clip(1) * step, 0) if step else x
+                maps[name] = x.astype(np.float32)
         recovered = is_recovered(source) & (maps["depth"] > 0)
         measured = (maps["depth"], maps["sigma"], maps["sigma"][recovered] / maps["depth"][recovered])
         image = to_rgb_uint8(reference)
+        # Where near returns refute the pose prior: 1 + index of the convention that it matches.
+        convention = int(added.get("pose_convention", torch.zeros(())))
+        refuted = convention > 0 or int(added["pose_code"]) == PoseCode.REFUTED
+        refuted = refuted or bool((added["gate"] == Gate.POSE_REFUTED).any())
+        valid = maps["depth"].reshape(-1, 1) > 0
+        moments = [FeatureMoments.of(maps[name].reshape(-1, 1), valid) for name in ("depth", "sigma")]
+        moments.append(FeatureMoments.of(image.reshape(-1, 3) / 255))
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
         columns = {
@@ -184,8 +187,8 @@ class MapRowDataset(RowDataset):
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
             "no_answer": np.bincount(reason[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
-            "refuted": _refuted_code(added),
-            "moments": _compute_moments(maps["depth"], maps["sigma"], image),
+            "refuted": np.asarray(1 + convention if refuted else 0),
+            "moments": np.concatenate([np.stack(each) for each in moments], 1),
             "ranges": np.stack([LogHistogram.of(x).counts for x in measured]).astype(np.int32),
             "problem": added["problem"].numpy(),
         }
@@ -232,32 +235,3 @@ def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> dict[str,
         if name in added:
             maps[name][pixel[:, 1], pixel[:, 0]] = added[name].numpy()
     return maps
-
-
-def _refuted_code(added: Mapping[str, Tensor]) -> np.ndarray:
-    """Columns of the transform -> 0, or 1 + index of the matched convention if near returns refute the pose prior."""
-    convention = int(added.get("pose_convention", torch.zeros(())))
-    refuted = (
-        convention > 0
-        or int(added["pose_code"]) == PoseCode.REFUTED
-        or bool((added["gate"] == Gate.POSE_REFUTED).any())
-    )
-    return np.asarray(1 + convention if refuted else 0)
-
-
-def _quantise(x: np.ndarray, step: float) -> np.ndarray:
-    """Values -> nearest multiples of ``step``, at least one step where positive; 0 = unquantised."""
-    if not step:
-        return x.astype(np.float32)
-    return np.where(x > 0, np.rint(x.astype(np.float64) / step).clip(1) * step, 0).astype(np.float32)
-
-
-def _compute_moments(depth: np.ndarray, sigma: np.ndarray, image: np.ndarray) -> np.ndarray:
-    valid = depth.reshape(-1, 1) > 0
-    all_moments = [FeatureMoments.of(x.reshape(-1, 1), valid) for x in (depth, sigma)]
-    all_moments.append(FeatureMoments.of(image.reshape(-1, 3) / 255))
-    return np.concatenate([np.stack(moments) for moments in all_moments], 1)
-
-
-def _format_hw(hw: Sequence[int]) -> str:
-    return f"{hw[0]}x{hw[1]}"

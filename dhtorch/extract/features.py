@@ -19,9 +19,6 @@ from dhtorch.extract.shards import read_shard_metadata, shard_files
 from dhtorch.runtime.safe_open import read_version
 from dhtorch.transforms.sample_access import get_value
 
-#: Maximum number of row groups cached in a process.
-_MAX_CACHED_GROUPS = 4
-
 
 class FeatureTable(Sequence[dict[str, Tensor]]):
     """The rows of an extraction, sorted by episode and frame; read lazily.
@@ -71,8 +68,18 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
     def __getitem__(self, index: int) -> dict[str, Tensor]:  # type: ignore[override]  # one row at a time
         i = range(len(self))[index]
         k = int(np.searchsorted(self._starts, i, "right")) - 1
-        at, values = _row_of(self.files[k], i - int(self._starts[k]), self.columns)
-        return {self.prefix + name: _tensor(values[name][at]) for name in self.columns}
+        file = self.files[k]
+        row = i - int(self._starts[k])
+        version = read_version(file)
+        starts = _starts(file, version)
+        group = int(np.searchsorted(starts, row, "right")) - 1
+        at, values = row - starts[group], _group(file, version, (starts[group], starts[group + 1]), self.columns)
+        row_values = {name: torch.from_numpy(np.array(values[name][at])) for name in self.columns}
+        # In the dtypes of the transform: bool, float32 or int32.
+        return {
+            self.prefix + name: x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.int()
+            for name, x in row_values.items()
+        }
 
     def at(self, episode: int, frame: int) -> dict[str, Tensor]:
         """Numbers of episode and frame -> row.
@@ -113,25 +120,11 @@ class JoinedDataset(Dataset[Any]):
         return {**sample, **self.features.at(*(int(get_value(sample, key)) for key in self.keys))}
 
 
-def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
-    """File and row -> (index in its row group, columns of the group)."""
-    version = read_version(file)
-    starts = _starts(file, version)
-    group = int(np.searchsorted(starts, row, "right")) - 1
-    return row - starts[group], _group(file, version, (starts[group], starts[group + 1]), columns)
-
-
 @lru_cache(maxsize=1024)
 def _starts(file: Path, _version: tuple[int, ...]) -> tuple[int, ...]:
     return read_parquet_header(file).groups
 
 
-@lru_cache(maxsize=_MAX_CACHED_GROUPS)
+@lru_cache(maxsize=4)
 def _group(file: Path, _version: tuple[int, ...], rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
     return read_columns(file, columns, rows)
-
-
-def _tensor(value: Any) -> Tensor:
-    """Stored value -> tensor copy in the dtypes of the transform: bool, float32 or int32."""
-    x = torch.from_numpy(np.array(value))
-    return x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.int()

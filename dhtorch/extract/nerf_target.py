@@ -15,23 +15,13 @@ from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.io.decode import decode_image
 from dhtorch.export import encode_png, nerfstudio, write_ply
 from dhtorch.extract.enriched import NUMBER_COLUMNS, DatasetCamera
-from dhtorch.extract.instants import iter_rows
-from dhtorch.extract.targets import MapCounts, Row
+from dhtorch.extract.targets import MapCounts, Row, iter_rows
 from dhtorch.geometry import camera as cameras
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import is_whole
 
 #: File of the points, as nerfstudio names its own.
 _POINTS_FILE = "sparse_pc.ply"
-
-#: Most points of a frame. Source: chosen as a few times those that a picture observes in COLMAP.
-_MAX_POINTS_PER_FRAME = 5000
-
-#: Most points of a recording, halved beyond twice as many. Source: chosen as those of a larger COLMAP model.
-_MAX_POINTS = 200_000
-
-#: Largest sigma / depth of a point. Source: that of a confidence of one half, see dhtorch.export.nerfstudio.
-_MAX_SIGMA_REL = 0.1
 
 
 class NerfstudioTarget:
@@ -62,8 +52,10 @@ class NerfstudioTarget:
                 return None
         except (OSError, ValueError, KeyError, TypeError):
             return None
-        if not all(map(_has_all_files, files, contents)):
-            return None
+        for file, content in zip(files, contents, strict=True):  # the images and points that it names, with all bytes
+            names = [name for shot in content["frames"] for key, name in shot.items() if key.endswith("file_path")]
+            if not all(is_whole(file.parent / name) for name in (content["ply_file_path"], *names)):
+                return None
         return {**summaries[0], "cameras": {name: x for summary in summaries for name, x in summary["cameras"].items()}}
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
@@ -95,12 +87,6 @@ class NerfstudioTarget:
         """As :meth:`DatasetTarget.finish`: nothing to write, the folders are independent."""
 
 
-def _has_all_files(file: Path, content: Row) -> bool:
-    """Whether the pictures and points that a ``transforms.json`` of this writer names are there, with all bytes."""
-    names = [name for shot in content["frames"] for key, name in shot.items() if key.endswith("file_path")]
-    return all(is_whole(file.parent / name) for name in (content["ply_file_path"], *names))
-
-
 class _PointCloud:
     """Coloured points (m, world of the recording) of some pixels of many frames."""
 
@@ -109,9 +95,13 @@ class _PointCloud:
         self.stride = 1
 
     def add(self, depth: np.ndarray, sigma: np.ndarray, row: Row, view: DatasetCamera, folder: Path) -> None:
-        """Add pixels of a frame, evenly taken among those of small sigma."""
-        chosen = np.flatnonzero((depth > 0) & (sigma <= _MAX_SIGMA_REL * depth))
-        chosen = chosen[:: self.stride * max(1, -(-len(chosen) // _MAX_POINTS_PER_FRAME))]
+        """Add pixels of a frame, evenly taken among those of small sigma.
+
+        A sigma of a tenth of the depth has a confidence of one half, see dhtorch.export.nerfstudio. 5000 points are a
+        few times those that an image observes in COLMAP, 200,000 those of a larger COLMAP model.
+        """
+        chosen = np.flatnonzero((depth > 0) & (sigma <= 0.1 * depth))
+        chosen = chosen[:: self.stride * max(1, -(-len(chosen) // 5000))]
         pixels = np.stack(np.unravel_index(chosen, depth.shape)[::-1], 1)  # u, v of the map
         uv = (pixels + 0.5) * np.divide(view.hw, view.map_hw)[::-1] - 0.5
         K, T = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
@@ -123,7 +113,7 @@ class _PointCloud:
         picture = np.broadcast_to(decode_image(row["picture"], folder / _POINTS_FILE), (3, *view.hw))
         xyz, rgb = xyz @ T[:3, :3].T + T[:3, 3], picture[:, line, column].T
         self.parts.append(np.concatenate((xyz, rgb), 1).astype(np.float32))
-        if sum(map(len, self.parts)) > 2 * _MAX_POINTS:
+        if sum(map(len, self.parts)) > 2 * 200_000:
             self.parts, self.stride = [part[::2] for part in self.parts], 2 * self.stride
 
     def write(self, path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -50,76 +50,66 @@ _REWRITTEN_META_FILES = (
 )
 
 
-class DatasetSource(Protocol):
-    """A data set with episodes: its content that an enriched data set copies."""
+class DatasetSource:
+    """A data set with episodes: its content that an enriched data set copies. What a format lacks is empty."""
 
-    @property
-    def version(self) -> int | None:
-        """Version of LeRobot's format; None = another format."""
-
-    @property
-    def tasks(self) -> tuple[str, ...] | None:
-        """Texts by ``task_index``; None = numbered in order of appearance."""
+    version: int | None = None  # of LeRobot's format; None = another format
+    tasks: tuple[str, ...] | None = None  # texts by ``task_index``; None = numbered in order of appearance
+    fps: float  # rows per second
+    robot: str = "unknown"
+    root: Path | None = None  # of the files that image cells name; None = cells hold images
+    bounds: Path | None = None  # folder that links must not lead out of; None = links are followed
 
     @property
     def features(self) -> dict[str, out.FeatureSpec]:
         """LeRobot features of its columns and videos."""
-
-    @property
-    def fps(self) -> float:
-        """Rows per second."""
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot."""
+        raise NotImplementedError
 
     @property
     def splits(self) -> dict[str, list[int]]:
         """Split name → episode numbers."""
+        return {}
 
     @property
     def more(self) -> dict[str, Path]:
         """Other files of the data set: relative name → file."""
+        return {}
 
-    @property
-    def root(self) -> Path | None:
-        """Folder of the files that image cells name; None = cells hold images."""
-
-    @property
-    def bounds(self) -> Path | None:
-        """Folder that links must not lead out of; None = links are followed, or no file is named by a cell."""
-
-    @property
-    def stats(self) -> dict[str, Any]:
-        """Statistics by feature, as in ``meta/stats.json``; empty if it has none."""
-
-    @property
-    def intrinsics(self) -> dict[str, Any]:
-        """Entries by camera, as in ``meta/intrinsics.json``; empty if it has none."""
+    def meta_file(self, name: str) -> dict[str, Any]:
+        """Object in a JSON file of LeRobot's ``meta/``; empty if there is none."""
+        return {}
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """Rows of episode ``i`` in order, as Arrow tables of few rows; new task texts are appended to ``tasks``."""
+        raise NotImplementedError
 
     def clips(self, i: int, length: int) -> dict[str, tuple[Path, out.VideoSegment]]:
         """Video key → file and segment of the ``i``-th opened episode of ``length`` rows."""
+        return {}
 
     def words(self, i: int) -> list[str] | None:
         """Task texts in the metadata of episode ``i``; None = those of its rows."""
+        return None
 
     def about(self, i: int) -> dict[str, Any]:
         """Other metadata of episode ``i``; ``split`` is the name of its split."""
+        return {}
 
 
-@dataclass(frozen=True, eq=False)
-class LeRobotSource:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LeRobotSource(DatasetSource):
     """A LeRobot data set: see :class:`DatasetSource`."""
 
     meta: LeRobotMeta
     info: dict[str, Any]
     episodes: LeRobotEpisodes
     tasks: tuple[str, ...]
+    version: int
+    fps: float
+    root: Path
+    robot: str
     limit: int | None = None
-    bounds: Path | None = None  # links must not lead out of this folder; None = links are followed
+    bounds: Path | None = None
 
     @classmethod
     def open(
@@ -133,43 +123,32 @@ class LeRobotSource:
         with doors.restrict_links(bounds):
             meta = read_lerobot_meta(root)
             info = files.read_json(root / "meta" / "info.json")
-            return cls(meta, info, read_lerobot_episodes(meta, numbers), tuple(_read_tasks(meta)), limit, bounds)
+            episodes, tasks = read_lerobot_episodes(meta, numbers), tuple(_read_tasks(meta))
+        return cls(
+            meta=meta,
+            info=info,
+            episodes=episodes,
+            tasks=tasks,
+            limit=limit,
+            bounds=bounds,
+            version=meta.version,
+            fps=meta.fps,
+            root=meta.root,
+            robot=str(info.get("robot_type") or "unknown"),
+        )
 
     @property
-    def version(self) -> int:
-        """Version of the format."""
-        return self.meta.version
+    def features(self) -> dict[str, out.FeatureSpec]:
+        """Features in its info, without videos that no opened episode has."""
+        videos = [self.episodes[i].videos for i in range(len(self.episodes))]
+        missing = {key for key in self.meta.videos if not any(each[key][0].is_file() for each in videos)}
+        return {k: dict(f) for k, f in self.info["features"].items() if k not in missing}
 
-    @property
-    def fps(self) -> float:
-        """Rows per second."""
-        return self.meta.fps
-
-    @property
-    def root(self) -> Path:
-        """Folder of the data set."""
-        return self.meta.root
-
-    @property
-    def stats(self) -> dict[str, Any]:
-        """Statistics in ``meta/stats.json``, where it is."""
-        return self._read_meta_file("stats.json")
-
-    @property
-    def intrinsics(self) -> dict[str, Any]:
-        """Entries in ``meta/intrinsics.json``, where it is."""
-        return self._read_meta_file("intrinsics.json")
-
-    def _read_meta_file(self, name: str) -> dict[str, Any]:
-        """Object in a JSON file of ``meta/``; empty if there is none."""
+    def meta_file(self, name: str) -> dict[str, Any]:
+        """As :meth:`DatasetSource.meta_file`."""
         file = self.meta.root / "meta" / name
         content = files.read_json(file) if file.is_file() and self._is_inside(file) else {}
         return content if isinstance(content, dict) else {}
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot."""
-        return str(self.info.get("robot_type") or "unknown")
 
     @property
     def splits(self) -> dict[str, list[int]]:
@@ -181,17 +160,6 @@ class LeRobotSource:
             if colon and first.isdigit() and last.isdigit():
                 episodes[str(name)] = [k for k in map(int, self.episodes.numbers) if int(first) <= k < int(last)]
         return {name: numbers for name, numbers in episodes.items() if numbers}
-
-    def about(self, i: int) -> dict[str, Any]:
-        """Empty: all metadata are copied."""
-        return {}
-
-    @property
-    def features(self) -> dict[str, out.FeatureSpec]:
-        """Features in its info, without videos that no opened episode has."""
-        episodes = range(len(self.episodes))
-        missing = {k for k in self.meta.videos if not any(self.episodes[i].videos[k][0].is_file() for i in episodes)}
-        return {k: dict(f) for k, f in self.info["features"].items() if k not in missing}
 
     def clips(self, i: int, length: int) -> dict[str, tuple[Path, out.VideoSegment]]:
         """Video key → file and segment of the ``i``-th opened episode of ``length`` rows.
@@ -226,7 +194,10 @@ class LeRobotSource:
         pyarrow, file = import_optional("pyarrow"), self.episodes[i].data
         try:
             for part in self._scan(i):
-                _check_task_index(part, file)
+                for value in part.column("task_index").to_pylist():
+                    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+                    if value is not None and not (is_number and 0 <= value < _MAX_TASKS and value == int(value)):
+                        raise FormatError(file, "task_index", value, f"a whole number from 0 to {_MAX_TASKS - 1}")
                 yield part
         except (pyarrow.ArrowException, OSError) as error:
             raise FormatError(file, "rows", error, "decodable columns") from None
@@ -247,10 +218,17 @@ class LeRobotSource:
                 continue
             part = pyarrow.Table.from_batches([batch])
             part = part if self.limit is None else part.slice(0, self.limit - done)
-            if "frame_index" not in part.column_names:
+            if "frame_index" not in part.column_names:  # counted, with time stamps from 0
+                stamp = part.column("timestamp").to_numpy()
                 first = part.column("timestamp")[0].as_py() if not done else first
-                part = _with_frame_index(part, done, first)
-            yield _with_task_index(part)
+                part = part.append_column("frame_index", pyarrow.array(done + np.arange(len(stamp))))
+                if first:
+                    place = part.column_names.index("timestamp")
+                    part = part.append_column("source.timestamp", part.column("timestamp"))
+                    part = part.set_column(place, "timestamp", pyarrow.array((stamp - first).astype(stamp.dtype)))
+            if "task_index" not in part.column_names:
+                part = part.append_column("task_index", pyarrow.array(np.zeros(part.num_rows, np.int64)))
+            yield part
             done += part.num_rows
 
     def words(self, i: int) -> list[str] | None:
@@ -266,34 +244,6 @@ class LeRobotSource:
         files = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
         kept = (p for p in sorted(files) if p.is_file() and p.name not in _REWRITTEN_META_FILES and self._is_inside(p))
         return {str(p.relative_to(root)): p for p in kept}
-
-
-def _with_frame_index(part: Any, done: int, first: float) -> Any:
-    """Add ``frame_index`` to rows, counted from ``done``; time stamps are shifted to start at 0 if ``first`` is not."""
-    pyarrow = import_optional("pyarrow")
-    stamp = part.column("timestamp").to_numpy()
-    part = part.append_column("frame_index", pyarrow.array(done + np.arange(len(stamp))))
-    if not first:
-        return part
-    place = part.column_names.index("timestamp")
-    part = part.append_column("source.timestamp", part.column("timestamp"))
-    return part.set_column(place, "timestamp", pyarrow.array((stamp - first).astype(stamp.dtype)))
-
-
-def _check_task_index(part: Any, file: Path) -> None:
-    """Raise FormatError for rows of the table ``file`` whose ``task_index`` is no whole number below the limit."""
-    for value in part.column("task_index").to_pylist():
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if value is not None and not (is_number and 0 <= value < _MAX_TASKS and value == int(value)):
-            raise FormatError(file, "task_index", value, f"a whole number from 0 to {_MAX_TASKS - 1}")
-
-
-def _with_task_index(part: Any) -> Any:
-    """Add ``task_index`` 0 to rows without one."""
-    pyarrow = import_optional("pyarrow")
-    if "task_index" in part.column_names:
-        return part
-    return part.append_column("task_index", pyarrow.array(np.zeros(part.num_rows, np.int64)))
 
 
 def _read_tasks(meta: LeRobotMeta) -> list[str]:

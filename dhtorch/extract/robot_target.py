@@ -18,7 +18,6 @@ from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
 from dhtorch.export.video import open_lossless_video
 from dhtorch.extract import pixel_columns, policy_columns
-from dhtorch.extract.columns import Column
 from dhtorch.extract.enriched import (
     MAP_FILES,
     MAP_STEPS,
@@ -28,19 +27,16 @@ from dhtorch.extract.enriched import (
     decode_map,
     number_column,
 )
-from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
-from dhtorch.extract.origin import SOURCE_CARD, DatasetSource, LeRobotSource
+from dhtorch.extract.origin import SOURCE_CARD, TABLE_GROUP_ROWS, DatasetSource, LeRobotSource
 from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
-from dhtorch.extract.targets import MapCounts, Row
+from dhtorch.extract.shards import iter_groups
+from dhtorch.extract.targets import MapCounts, PeekableRows, Row, iter_instants, iter_rows
 from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import is_whole
 
 #: Key of the metadata with the summary of an episode.
 _EPISODE_METADATA_KEY = b"dhtorch.episode"
-
-#: Task text of recordings without one.
-_DEFAULT_TASK = "look around"
 
 
 class LeRobotTarget:
@@ -87,7 +83,7 @@ class LeRobotTarget:
     ) -> None:
         self.root, self.version, self.views = root, version, views
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
-        self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
+        self.tasks = origin.tasks if origin is not None else (task or "look around",)
         self.key, self.n, self.cut = key, n, cut
         self.maps, self.as_images = tuple(maps), as_images
         if "geometry_image" in self.maps:
@@ -101,7 +97,13 @@ class LeRobotTarget:
             if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
                 raise ValueError(f"data: found a feature called {name!r}, expected a name without / and ..")
         if version == 2 and isinstance(origin, LeRobotSource) and origin.version == 3:
-            _refuse_shared_videos(origin)
+            for video in (k for k, f in origin.features.items() if f["dtype"] == "video"):
+                starts = origin.episodes.columns[f"videos/{video}/from_timestamp"]
+                files = {origin.episodes[i].videos[video][0] for i in range(len(origin.episodes))}
+                if np.any(starts != 0) or len(files) != len(starts):
+                    raise ValueError(
+                        f"format: found videos of several episodes ({video}), expected one each for v2.1; use lerobot"
+                    )
 
     # -------------------------------------------------------------------------------------------------- the columns
 
@@ -143,10 +145,11 @@ class LeRobotTarget:
     def added(self) -> dict[str, FeatureSpec]:
         """LeRobot features of the added columns."""
         features: dict[str, FeatureSpec] = {}
+        numbers = {key: number_column(c, self.n) for key, c in NUMBER_COLUMNS.items()}
         for key, view in self.views.items():
             by_kind: dict[str, FeatureSpec] = {
                 **{name: self._map_feature(name, view) for name in MAP_FILES},
-                **{key: _number_feature(number_column(c, self.n)) for key, c in NUMBER_COLUMNS.items()},
+                **{key: lerobot.number_feature(c.kind, math.prod(c.shape)) for key, c in numbers.items()},
                 "geometry_image": policy_columns.geometry_feature(view.hw, self.fps),
                 "point_cloud": policy_columns.cloud_feature(),
                 "K": lerobot.number_feature("float64", 9),
@@ -211,7 +214,11 @@ class LeRobotTarget:
             policy = {key: closing.enter_context(self._open_policy_columns(k, key)) for key in self.views}
             for table in self._join_rows(k, start, parts, tallies, policy, tasks):
                 if writer is None:
-                    layout = lerobot.make_arrow_schema(self.features(table.column_names), _column_types(table), {})
+                    layout = lerobot.make_arrow_schema(
+                        self.features(table.column_names),
+                        dict(zip(table.schema.names, table.schema.types, strict=True)),
+                        {},
+                    )
                     writer = closing.enter_context(parquet.ParquetWriter(sink, layout, compression="zstd"))
                 writer.write_table(table.select(layout.names).cast(layout))
                 length += table.num_rows
@@ -248,27 +255,24 @@ class LeRobotTarget:
             return
         done = 0
         for part in self.origin.batches(k, tasks):
-            table, n = self._unpack_images(part), part.num_rows
+            table, n = part, part.num_rows
+            for key, feature in self.pixels.items():  # images of one channel become numbers
+                cells = table.column(key).to_pylist()
+                pixels = pixel_columns.decode_cells(
+                    key, self.source_features[key], cells, self.origin.root, feature["dtype"]
+                )
+                table = table.set_column(table.column_names.index(key), key, pixels)
             numbers = part.column("frame_index").to_pylist()
             times = part.column("timestamp").to_pylist() if "timestamp" in part.column_names else self._times(numbers)
             for key, rows in rows_by_camera.items():
                 camera_rows = [rows.take(i) for i in numbers]
                 for row in camera_rows:
                     tallies[key].add(row)
-                cells = {**self._cells(key, camera_rows, done), **policy[key].add(camera_rows, times)}
-                for column, values in cells.items():
+                added = {**self._cells(key, camera_rows, done), **policy[key].add(camera_rows, times)}
+                for column, values in added.items():
                     table = table.append_column(column, values)
             yield self._renumber(table, k, start + done)
             done += n
-
-    def _unpack_images(self, table: Any) -> Any:
-        """Rows of the source, with its images of one channel as numbers."""
-        for key, feature in self.pixels.items():
-            cells = table.column(key).to_pylist()
-            root = None if self.origin is None else self.origin.root
-            pixels = pixel_columns.decode_cells(key, self.source_features[key], cells, root, feature["dtype"])
-            table = table.set_column(table.column_names.index(key), key, pixels)
-        return table
 
     def _recording_rows(
         self,
@@ -281,7 +285,7 @@ class LeRobotTarget:
         """Rows of an episode from recordings, without instants that have an unreadable frame."""
         pyarrow = import_optional("pyarrow")
         done = 0
-        for group in iter_groups(iter_instants(rows_by_camera)):
+        for group in iter_groups(iter_instants(rows_by_camera), TABLE_GROUP_ROWS):
             for shots in group:
                 for key, row in shots.items():
                     tallies[key].add(row)
@@ -336,7 +340,8 @@ class LeRobotTarget:
                 stored = number_column(NUMBER_COLUMNS[kind], self.n)
                 blank = np.zeros(stored.shape, stored.kind)
                 rows = [row[kind] if row is not None and row["depth"] else blank for row in camera_rows]
-                values = [_flat_number(row) for row in rows]
+                values = [np.asarray(row).reshape(-1).tolist() for row in rows]
+                values = [x[0] if len(x) == 1 else x for x in values]
             else:
                 n = 9 if kind == "K" else 16
                 values = [row[kind] if row is not None and row["depth"] else [float("nan")] * n for row in camera_rows]
@@ -532,7 +537,7 @@ class LeRobotTarget:
 
     def _source_stats(self, name: str, channels: int, frames: int) -> dict[str, Any]:
         """Statistics of a picture that was not read: the source's, else those that change nothing."""
-        entry = {} if self.origin is None else self.origin.stats.get(name, {})
+        entry = {} if self.origin is None else self.origin.meta_file("stats.json").get(name, {})
         shapes = [np.shape(entry.get(k) or 0) for k in ("mean", "std")] if isinstance(entry, dict) else []
         if shapes == [(channels, 1, 1)] * 2:
             return {**entry, "count": [frames]}
@@ -584,34 +589,8 @@ class LeRobotTarget:
     def _write_lenses(self) -> None:
         """Write distortion coefficients, which the format cannot hold, to the side-car file ``intrinsics.json``, with
         the source's entries of other cameras."""
-        others = {} if self.origin is None else self.origin.intrinsics
+        others = {} if self.origin is None else self.origin.meta_file("intrinsics.json")
         entries = {key: entry for key, entry in others.items() if key not in self.views}
         entries |= {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
         if entries:
             storage.write_json(self.root / "meta" / "intrinsics.json", entries)
-
-
-def _number_feature(column: Column) -> FeatureSpec:
-    """Column of numbers -> LeRobot feature."""
-    return lerobot.number_feature(column.kind, math.prod(column.shape))
-
-
-def _flat_number(value: Any) -> Any:
-    """Array -> number, or flat list if it has several, as a LeRobot table stores it."""
-    flat = np.asarray(value).reshape(-1).tolist()
-    return flat[0] if len(flat) == 1 else flat
-
-
-def _column_types(table: Any) -> dict[str, Any]:
-    return dict(zip(table.schema.names, table.schema.types, strict=True))
-
-
-def _refuse_shared_videos(origin: LeRobotSource) -> None:
-    """Raises ValueError if a video file holds several episodes, which v2.1 does not allow."""
-    for key in (k for k, f in origin.features.items() if f["dtype"] == "video"):
-        starts = origin.episodes.columns[f"videos/{key}/from_timestamp"]
-        files = {origin.episodes[i].videos[key][0] for i in range(len(origin.episodes))}
-        if np.any(starts != 0) or len(files) != len(starts):
-            raise ValueError(
-                f"format: found videos of several episodes ({key}), expected one each for v2.1; use lerobot"
-            )

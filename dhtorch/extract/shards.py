@@ -27,18 +27,6 @@ _SHARED_METADATA_KEY = b"dhtorch"
 #: Key of the metadata of one shard.
 _SHARD_METADATA_KEY = b"dhtorch.shard"
 
-#: Fields of the shared metadata and of a shard's own that are read -> their types.
-_SHARED_FIELDS: dict[str, type] = {"key": str, "config": dict, "columns": dict, "data.digest": str}
-_SHARD_FIELDS: dict[str, type] = {"of": int, "counts": dict}
-
-#: Maximum rows of a row group, which is decoded as a whole: few, because a shuffled loader reads one row at a time.
-_MAX_GROUP_ROWS = 16
-
-#: Maximum bytes of a row group: maps are large.
-_MAX_GROUP_BYTES = 1 << 24
-
-_PATTERN = "shard-*.parquet"
-
 
 def write_shard(
     folder: Path, shard: ShardSpec, rows: Iterable[Row], wanted: Mapping[str, Column], shared: Mapping[str, Any]
@@ -63,7 +51,9 @@ def write_shard(
         storage.write_atomically(folder / shard.name) as file,
         parquet.ParquetWriter(file, layout, compression="zstd") as writer,
     ):
-        for group in _iter_groups(rows, _rows_per_group(wanted)):
+        # A row group is decoded as a whole: few rows, because a shuffled loader reads one at a time; maps are large.
+        row_bytes = sum(column.n_bytes for column in wanted.values())
+        for group in iter_groups(rows, max(1, min(16, (1 << 24) // row_bytes))):
             counts.update(problems[str(int(row["problem"]))].lower() for row in group)
             writer.write_table(arrow_table(group, wanted, layout))
         counts["skipped"] = len(shard.rows) - counts.total()
@@ -72,14 +62,9 @@ def write_shard(
     return counts
 
 
-def _rows_per_group(wanted: Mapping[str, Column]) -> int:
-    """Columns -> rows of a row group, at least one."""
-    return max(1, min(_MAX_GROUP_ROWS, _MAX_GROUP_BYTES // sum(column.n_bytes for column in wanted.values())))
-
-
 def shard_files(folder: Path) -> list[Path]:
     """Folder -> its shards, in the order of their rows."""
-    return sorted(folder.glob(_PATTERN))
+    return sorted(folder.glob("shard-*.parquet"))
 
 
 def find_finished_shards(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:
@@ -117,13 +102,14 @@ def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         shared, own = (storage.parse_strict_json(metadata[key].decode()) for key in keys)
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
-    for value, fields in ((shared, _SHARED_FIELDS), (own, _SHARD_FIELDS)):
-        for name, kind in fields.items():
-            files.get_entry(value, name, kind, path)
+    fields: dict[str, type] = {"key": str, "config": dict, "columns": dict, "data.digest": str}
+    for name, kind in {**fields, "of": int, "counts": dict}.items():
+        files.get_entry(shared if name in fields else own, name, kind, path)
     return shared, own
 
 
-def _iter_groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
+def iter_groups(rows: Iterable[Any], size: int) -> Iterator[list[Any]]:
+    """Rows -> lists of up to ``size`` of them."""
     rows = iter(rows)
     while group := list(islice(rows, size)):
         yield group

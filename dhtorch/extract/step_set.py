@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,14 @@ from dhtorch.data.readers.rlds_steps import EpisodeSteps
 from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
 from dhtorch.extract.enriched import camera_feature
-from dhtorch.extract.origin import TABLE_GROUP_ROWS
+from dhtorch.extract.origin import TABLE_GROUP_ROWS, DatasetSource
 
 #: Columns that every table has; a feature of the same name gets a prefix.
 _RESERVED_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
-#: First bytes of a JPEG file.
-_JPEG_MAGIC = b"\xff\xd8"
-
-
 @dataclass(frozen=True, eq=False)
-class RldsSource:
+class RldsSource(DatasetSource):
     """An RLDS data set: see :class:`dhtorch.extract.origin.DatasetSource`.
 
     Args:
@@ -41,12 +36,6 @@ class RldsSource:
     fps: float
     limit: int | None = None
     cached: dict[int, EpisodeSteps] = field(default_factory=dict, repr=False)  # steps of the episode read last
-
-    version = None
-    tasks = None
-    root = None
-    bounds = None
-    robot = "unknown"
 
     @property
     def features(self) -> dict[str, out.FeatureSpec]:
@@ -69,26 +58,6 @@ class RldsSource:
                 )
         return features
 
-    @property
-    def splits(self) -> dict[str, list[int]]:
-        """None: the split is part of :meth:`about` of each episode."""
-        return {}
-
-    @property
-    def stats(self) -> dict[str, Any]:
-        """None: the format has no statistics."""
-        return {}
-
-    @property
-    def intrinsics(self) -> dict[str, Any]:
-        """None: the format has no such file."""
-        return {}
-
-    @property
-    def more(self) -> dict[str, Path]:
-        """None: its other files describe the TFRecord files."""
-        return {}
-
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`DatasetSource.batches`."""
         pyarrow = import_optional("pyarrow")
@@ -105,14 +74,6 @@ class RldsSource:
                 if name != steps.instruction:
                     columns[_column_name(name, spec.kind == "image")] = _read_cells(steps, name, part)
             yield pyarrow.table(columns)
-
-    def clips(self, i: int, length: int) -> dict[str, tuple[Path, out.VideoSegment]]:
-        """None: images are encoded in the steps."""
-        return {}
-
-    def words(self, i: int) -> list[str] | None:
-        """None: the tasks are those of the rows."""
-        return None
 
     def about(self, i: int) -> dict[str, Any]:
         """Split, number within the split, and metadata of the episode."""
@@ -138,7 +99,7 @@ def _read_cells(steps: EpisodeSteps, name: str, part: range) -> Any:
     values = steps.values(name, part)
     kind = steps.features[name].kind
     if kind == "image":
-        suffixes = ["jpg" if content[:2] == _JPEG_MAGIC else "png" for content in values]
+        suffixes = ["jpg" if content[:2] == b"\xff\xd8" else "png" for content in values]
         return pyarrow.array(
             [
                 {"bytes": x, "path": f"frame-{i:06d}.{suffix}"}

@@ -7,19 +7,16 @@ into one file, whose metadata hold the summary of all rows. After an interruptio
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from dhtorch.data.io.decode import import_optional
 from dhtorch.export.lerobot import FeatureMoments, LogHistogram
+from dhtorch.extract.columns import Row
 from dhtorch.geometry.pose_conventions import CONVENTIONS
-
-Row = dict[str, Any]
-
-#: Maximum number of time bins of an episode in its summary.
-_N_TIME_BINS = 24
 
 #: Name in the summary for refuted poses that match no convention.
 UNKNOWN_CONVENTION = "unknown"
@@ -74,7 +71,7 @@ class MapCounts:
             no_pixels: Row = {key: [] for key in keys}
             return {**no_pixels, "unread": self.unread, "frames": 0, "refuted": {}}
         pixels, no_answer = np.stack(self.pixels), np.stack(self.no_answer)
-        parts = np.array_split(np.arange(len(pixels)), min(_N_TIME_BINS, len(pixels)))
+        parts = np.array_split(np.arange(len(pixels)), min(24, len(pixels)))
         along, reasons = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, no_answer))
         more = {"over_time": along, "no_answer_over_time": reasons, "unread": self.unread}
         more |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
@@ -91,3 +88,39 @@ class MapCounts:
     def image_moments(self) -> FeatureMoments | None:
         """Moments of red, green and blue; None if no frame could be read."""
         return None if self.moments is None else FeatureMoments(*(x[2:5] for x in self.moments))
+
+
+def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
+    """Shards -> their rows in order, one group in memory at a time."""
+    parquet = import_optional("pyarrow.parquet")
+    for path in parts:
+        with parquet.ParquetFile(path) as file:
+            for batch in file.iter_batches(batch_size=8):
+                yield from batch.to_pylist()
+
+
+class PeekableRows:
+    """Iterator over rows with access to the next row before it is taken."""
+
+    def __init__(self, rows: Iterator[Row]) -> None:
+        self.rows = rows
+        self.row = next(rows, None)
+
+    def take(self, frame: int) -> Row | None:
+        """Frame number -> the next row if it belongs to that frame, else None."""
+        row = self.row
+        if row is None or row["frame_index"] != frame:
+            return None
+        self.row = next(self.rows, None)
+        return row
+
+
+def iter_instants(rows_by_camera: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
+    """Rows by camera -> rows of each instant that all cameras have; other rows are skipped."""
+    while all(rows.row is not None for rows in rows_by_camera.values()):
+        latest = max(rows.row["frame_index"] for rows in rows_by_camera.values() if rows.row is not None)
+        for rows in rows_by_camera.values():
+            while rows.row is not None and rows.row["frame_index"] < latest:
+                rows.row = next(rows.rows, None)
+        if all(rows.row is not None and rows.row["frame_index"] == latest for rows in rows_by_camera.values()):
+            yield {key: row for key, rows in rows_by_camera.items() if (row := rows.take(latest)) is not None}

@@ -61,7 +61,7 @@ def map_to_samples(depth_map: DepthMap, frame: Frame, method: Method) -> tuple[M
 
     Gradient: to depth and sigma.
     """
-    uv = dense.map_pixel_centres(frame, tuple(depth_map.depth.shape[-2:]))
+    uv = dense.map_pixel_centres(frame, (depth_map.depth.shape[-2], depth_map.depth.shape[-1]))
     with torch.no_grad():
         hole = method.sample_depth_at(frame, uv).hole
     depth, sigma = (torch.where(depth_map.keep, x, 0.0).flatten(1) for x in (depth_map.depth, depth_map.sigma))

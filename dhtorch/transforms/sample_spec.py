@@ -150,9 +150,9 @@ class SampleSpec:
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
             conf = conf[:, at if conf.shape[1] > 1 else 0]
-            high = conf.flatten(1).amax(1)
+            level = conf.flatten(1).amax(1)
             text = f"{self.confidence}: found the value {{:.4g}}, expected 0 low, 1 medium, 2 high"
-            checks.append((~(high <= 2) | (conf != conf.floor()).flatten(1).any(1), high, text))
+            checks.append((~(level <= 2) | (conf != conf.floor()).flatten(1).any(1), level, text))
             conf = conf.clamp(0, 2).to(torch.uint8).contiguous()
             if conf.shape != depth.shape:
                 raise SampleError(

@@ -15,15 +15,14 @@ pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
 import pyarrow
-from omegaconf import OmegaConf
 from pyarrow import parquet
 from support import writers
 from support.processes import start, stop
 
 import dhtorch
-from dhtorch import data, extract
-from dhtorch.cli.run import config_dir, main
-from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
+from dhtorch import data
+from dhtorch.cli.run import main
+from dhtorch.extract import FeatureTable, JoinedDataset, engines
 from dhtorch.geometry import camera as cam
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleProblem
@@ -114,15 +113,6 @@ def live(root, **options):
     return ExtendedDataset(Items(root), ExtendDepth(method=method, n=N, **views, **options), gap=GAP)
 
 
-@pytest.mark.slow
-def test_a_gap_of_zero_reads_no_second_view(robot, command):
-    code, out, err = command(*asked(robot, "extract.columns=[depth]", gap=0))
-    assert code == 0 and err == "" and "12 no second view" in out
-    assert len(FeatureTable("features")) == sum(LENGTHS)
-    code, _, err = command(*asked(robot, gap=-1))
-    assert code == 2 and "extract.gap: found -1, expected a whole number of at least 0" in err
-
-
 def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     code, out, err = command(*asked(robot))
     assert code == 0 and err == "", err
@@ -145,28 +135,18 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
 
 
 def test_rows_join_the_data_set_by_episode_and_frame(robot, command):
-    assert command(*asked(robot))[0] == 0
+    assert command(*asked(robot, "data.episode=[2,0]", gap=0))[0] == 0
     ours = pyarrow.concat_tables(parquet.read_table(p) for p in files("features"))
-    theirs = parquet.read_table(
-        next(robot.glob("data/*/*.parquet")), columns=["episode_index", "frame_index", "timestamp"]
-    )
+    place = ["episode_index", "frame_index", "timestamp"]
+    theirs = parquet.read_table(next(robot.glob("data/*/*.parquet")), columns=place)
     order = list(zip(ours["episode_index"].to_pylist(), ours["frame_index"].to_pylist(), strict=True))
-    assert order == sorted(order) == [(e, f) for e, n in enumerate(LENGTHS) for f in range(n)]
-    pairs = ours.select(["episode_index", "frame_index", "timestamp"]).join(
-        theirs, ["episode_index", "frame_index"], right_suffix="_theirs", join_type="inner"
-    )
-    assert pairs.num_rows == sum(LENGTHS)
+    assert order == [(e, f) for e in (0, 2) for f in range(LENGTHS[e])], "episodes keep their numbers"
+    pairs = ours.select(place).join(theirs, place[:2], right_suffix="_theirs", join_type="inner")
+    assert pairs.num_rows == LENGTHS[0] + LENGTHS[2]
     assert np.allclose(pairs["timestamp"], pairs["timestamp_theirs"], atol=1e-6)
-    assert set(ours["recording"].to_pylist()) == {f"set/episode_{e:06d}/front" for e in range(3)}
-
-
-def test_episodes_keep_their_numbers(robot, command):
-    assert command(*asked(robot, "data.episode=[2,0]"))[0] == 0
-    features = FeatureTable("features", ["tokens"])
-    assert sorted(set(features.place["episode_index"])) == [0, 2] and len(features) == LENGTHS[0] + LENGTHS[2]
-    assert features.at(2, 1).keys() == {"dhtorch.tokens"}
+    assert set(ours["recording"].to_pylist()) == {f"set/episode_{e:06d}/front" for e in (0, 2)}
     with pytest.raises(KeyError, match="frame 0 of episode 1"):
-        features.at(1, 0)
+        FeatureTable("features", ["tokens"]).at(1, 0)
 
 
 @pytest.mark.slow
@@ -181,14 +161,8 @@ def test_workers_make_the_same_files(robot, command):
 def many(tmp_path, shots):
     """Numbered frames on the disk, each a shard."""
     writers.write_counted_frames(tmp_path / "set", shots)
-    return [
-        "data=auto",
-        f"data.root={tmp_path / 'set'}",
-        "extract.gap=2",
-        "out=features",
-        "extract.shard_rows=1",
-        *PAPER,
-    ]
+    place = ["data=auto", f"data.root={tmp_path / 'set'}", "out=features"]
+    return [*place, "extract.gap=2", "extract.shard_rows=1", *PAPER]
 
 
 @pytest.mark.slow
@@ -216,31 +190,6 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkeypatch):
-    real, calls = shards.write_shard, []
-
-    def interrupted(*args):
-        calls.append(1)
-        if len(calls) == 2:
-            signal.raise_signal(signal.SIGINT)
-        return real(*args)
-
-    monkeypatch.setattr(shards, "write_shard", interrupted)
-    code, out, err = command(*asked(robot))
-    assert code == 130 and "Traceback" not in err and out == ""
-    assert (
-        "interrupted: 1 of 3 shards in features are complete and stay; run the same command again for the rest" in err
-    )
-    before = seen(files("features"))
-    assert len(before) == 1
-    with pytest.raises(data.FormatError, match="found 1, expected 3: run the same dhtorch extract again"):
-        FeatureTable("features")
-    code, out, _ = command(*asked(robot))
-    assert code == 0 and "3 shards (1 left untouched)" in out
-    assert {k: v for k, v in seen(files("features")).items() if k in before} == before
-
-
-@pytest.mark.slow
 def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path, many):
     process = start(tmp_path, "extract", *many, "workers=2")
     code = stop(process, partial(files, tmp_path / "features"), 2, signal.SIGINT)
@@ -256,18 +205,12 @@ def without_notes(err):
 
 @pytest.fixture
 def damaged(tmp_path, shots):
-    """Numbered frames, the fourth with half a picture."""
+    """Numbered frames, the fourth with half an image."""
     writers.write_counted_frames(tmp_path / "set", shots[:8])
     image = tmp_path / "set" / "images" / "00003.png"
     image.write_bytes(image.read_bytes()[:500])
-    return [
-        "data=auto",
-        f"data.root={tmp_path / 'set'}",
-        "extract.gap=2",
-        "out=features",
-        "extract.shard_rows=3",
-        *PAPER,
-    ]
+    place = ["data=auto", f"data.root={tmp_path / 'set'}", "out=features"]
+    return [*place, "extract.gap=2", "extract.shard_rows=3", *PAPER]
 
 
 def test_a_corrupt_frame_raises_in_one_line(damaged, command):
@@ -278,25 +221,24 @@ def test_a_corrupt_frame_raises_in_one_line(damaged, command):
     assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]
 
 
-@pytest.mark.slow
-def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
-    code, out, err = command(*damaged, "extract.on_error=skip")
+@pytest.mark.parametrize("on_error", [pytest.param("skip", marks=pytest.mark.slow), "flag"])
+def test_a_corrupt_frame_is_skipped_or_flagged_with_zeros_and_counted(on_error, damaged, command):
+    args = [*damaged, f"extract.on_error={on_error}", "workers=1"]
+    code, out, err = command(*args)
     assert code == 0 and not without_notes(err), err
-    assert "7 rows" in out and "1 skipped" in out and "00003.png" in out
+    name, kept = ("1 skipped", [0, 1, 2, 4, 5, 6, 7]) if on_error == "skip" else ("1 unreadable", list(range(8)))
+    assert f"{len(kept)} rows" in out and name in out and "00003.png" in out
     assert "3 no second view" in out, "the two first, and the one whose other view cannot be read"
-    assert FeatureTable("features").place["frame_index"].tolist() == [0, 1, 2, 4, 5, 6, 7]
-    code, out, _ = command(*damaged, "extract.on_error=skip")
-    assert "(3 left untouched), 7 rows" in out and "1 skipped" in out, "counts are kept with the shards"
-
-
-def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
-    code, out, _ = command(*damaged, "extract.on_error=flag", "workers=1")
-    assert code == 0 and "8 rows" in out and "1 unreadable" in out
     features = FeatureTable("features")
-    assert [int(row["dhtorch.problem"]) for row in features] == [1, 1, 0, 3, 0, 1, 0, 0]
-    row = features.at(0, 3)
-    assert int(row.pop("dhtorch.problem")) == SampleProblem.UNREADABLE and all(not x.any() for x in row.values())
-    assert np.isnan(features.place["timestamp"]).all(), "counted frames have no times"
+    assert features.place["frame_index"].tolist() == kept and np.isnan(features.place["timestamp"]).all()
+    assert [int(row["dhtorch.problem"]) for row in features] == [
+        {2: 0, 3: 3, 4: 0}.get(k, int(k in (0, 1, 5))) for k in kept
+    ]
+    if on_error == "flag":
+        row = features.at(0, 3)
+        assert int(row.pop("dhtorch.problem")) == SampleProblem.UNREADABLE and all(not x.any() for x in row.values())
+    code, out, _ = command(*args)
+    assert f"(3 left untouched), {len(kept)} rows" in out and name in out, "counts are kept with the shards"
 
 
 @pytest.mark.parametrize(
@@ -308,6 +250,8 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
         (["out=x", "extract.engine=dask"], ["extract.engine", "dask", "local, ray"]),
         (["out=x", "extract.tokens_hw=null"], ["extract.tokens_hw", "expected"]),
         (["out=x", "extract.shardrows=4"], ["shardrows"]),
+        (["out=x", "data.n_frames=3", "extract.dense={sise: 48}"], ["extract.dense: found 'sise'"]),
+        (["out=x", "data.n_frames=3", "extract.gap=-1"], ["extract.gap: found -1, expected a whole number of at least 0"]),
         (["out=file", "data.n_frames=3"], ["file", "expected a folder"]),
         (["out=file/below", "data.n_frames=3"], ["file"]),
         (["out=x", "method=window", "extract.gap=3"], ["views", "5"]),
@@ -322,57 +266,17 @@ def test_bad_input_gets_one_clear_line(command, args, words):
     assert not files("x")
 
 
-@pytest.mark.slow
-def test_a_recording_without_a_gap_asks_for_one(robot, command):
-    code, _, err = command("data=lerobot", f"data.root={robot}", "extract.gap=null", "out=x", *PAPER)
-    assert code == 2 and "extract.gap" in err and "0 = front end only" in err
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written(robot, command):
-    Path("features").mkdir(mode=0o500)
-    code, _, err = command(*asked(robot))
-    assert code == 2 and "Permission denied" in err and "features" in err
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_one_line(robot, command, monkeypatch):
-    real = columns.arrow_table
-
-    def full(rows, *args):
-        if rows[0]["frame_index"]:
-            raise OSError(28, "No space left on device")
-        return real(rows, *args)
-
-    monkeypatch.setattr(shards, "_MAX_GROUP_ROWS", 1)
-    monkeypatch.setattr(shards, "arrow_table", full)
-    code, _, err = command(*asked(robot))
-    assert code == 2 and "No space left" in err and not Path("features").exists(), err
-
-
-@pytest.mark.slow
-def test_shards_of_another_extraction_are_not_mixed(robot, command, tmp_path):
-    assert command(*asked(robot))[0] == 0
-    before = seen(files("features"))
-    for other, words in (
-        ("seed=1", "seed 0 there, 1 here"),
-        ("data.episode=0", "data.episode None there, 0 here"),
-    ):
-        code, _, err = command(*asked(robot, other))
-        assert code == 2 and words in err and "another extraction" in err and len(err.strip().splitlines()) == 1, err
-    assert seen(files("features")) == before
-
-
-def test_a_missing_pyarrow_is_named(command, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    code, _, err = command("out=x", "data.n_frames=3")
-    assert code == 2 and err.strip().endswith("pip install pyarrow") and len(err.strip().splitlines()) == 1
-
-
-def test_a_missing_ray_names_the_extra(command, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    code, _, err = command("out=x", "data.n_frames=3", "data.hw=[60,80]", "extract.engine=ray")
-    assert code == 2 and "ray" in err and "dhtorch[scale]" in err and len(err.strip().splitlines()) == 1
+@pytest.mark.parametrize(
+    ("module", "more", "words"),
+    [
+        ("pyarrow.parquet", [], "pip install pyarrow\n"),
+        ("ray", ["data.hw=[60,80]", "extract.engine=ray"], "dhtorch[scale]"),
+    ],
+)
+def test_a_missing_library_is_named(module, more, words, command, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    code, _, err = command("out=x", "data.n_frames=3", *more)
+    assert code == 2 and words in err and len(err.strip().splitlines()) == 1
 
 
 def test_a_killed_worker_is_said(monkeypatch):
@@ -385,14 +289,6 @@ def test_a_killed_worker_is_said(monkeypatch):
 
     with pytest.raises(ChildProcessError, match="memory for 1 workers"):
         list(engines.run_local(Deadly(), range(4), 1))
-
-
-def test_a_method_of_many_views_looks_back_several_times(command):
-    window = ["data.hw=[72,96]", "data.n_frames=6", "data.supersample=1", "data.lidar=exact", "method=window"]
-    code, out, err = command(*window, "method.n=64", "method.views=2", "extract.gap=3", "out=window")
-    assert code == 0 and "6 rows" in out, err
-    problems = [int(row["dhtorch.problem"]) for row in FeatureTable("window")]
-    assert problems == [1, 1, 0, 0, 0, 0], "the nearer view, two frames back, is there before the farther one"
 
 
 @pytest.mark.slow
@@ -410,8 +306,44 @@ def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
     assert rows[5]["dhtorch.pose_ok"] and length["chosen"] > 2 * length["one"], "a wider one is worth more"
 
 
-def test_settings_are_the_defaults():
-    cfg = OmegaConf.to_container(OmegaConf.load(config_dir() / "extract.yaml"))["extract"]
-    assert cfg.pop("_target_") == "dhtorch.extract.ExtractOptions"
-    defaults = {k: f.default for k, f in extract.ExtractOptions.__dataclass_fields__.items()}
-    assert cfg == {k: list(v) if isinstance(v, tuple) else v for k, v in defaults.items()}
+MAPS = ["data.hw=[96,128]", "data.depth_hw=[48,64]", "data.n_frames=3", "data.supersample=1", "data.path=lateral"]
+MAPS += [
+    "data.step_m=0.1",
+    "data.range_limit=2.0",
+    "method=map",
+    "method.n=256",
+    "extract.gap=2",
+    "extract.shard_rows=2",
+]
+
+
+@pytest.mark.slow
+def test_maps_are_written_read_back_and_resumed(command):
+    def call(refinements=0):
+        dense = f"extract.dense={{size: 48, planes: 12, max_sigma_rel: 0.3, refinements: {refinements}}}"
+        return command(*MAPS, "out=out", "extract.half=true", dense)
+
+    code, out, err = call()
+    assert code == 0 and "2 shards, 3 rows" in out, err
+    features = FeatureTable("out")
+    about = features.about["columns"]
+    wanted = {
+        k: ("float16", [36, 48], unit) for k, unit in (("depth_map", "m"), ("sigma_map", "m"), ("score_map", "1"))
+    }
+    wanted |= {k: ("uint8", [36, 48], "code") for k in ("source_map", "gate_map")}
+    assert {k: (about[k]["kind"], about[k]["shape"], about[k]["unit"]) for k in wanted} == wanted
+    assert all("0 = none, where a DepthMap has NaN" in about[k]["about"] for k in ("depth_map", "sigma_map"))
+    assert features.about["codes"]["source_map"]["3"] == "SWEPT"
+    rows = [{k.removeprefix("dhtorch."): x for k, x in row.items()} for row in features]
+    assert [3 in row["source_map"] for row in rows] == [False, False, True]
+    for row in rows:
+        assert all(
+            row[k].dtype == (torch.int32 if kind == "uint8" else torch.float32) for k, (kind, *_) in wanted.items()
+        )
+        assert row["depth_map"].any() and torch.equal(row["depth_map"] > 0, row["source_map"] > 0)
+        assert torch.equal(row["depth_map"], row["depth_map"].half().float())
+    before = contents("out")
+    Path("out/shard-00001.parquet").unlink()
+    assert "2 shards (1 left untouched), 3 rows" in call()[1] and contents("out") == before
+    code, _, err = call(refinements=1)
+    assert code == 2 and "extract.dense.refinements 0 there, 1 here" in err

@@ -60,13 +60,6 @@ def test_every_frame_is_a_row(made):
     assert done.shown == [("6 frames", 6)]
 
 
-def test_what_a_killed_run_left_is_gone(made, tmp_path):
-    left = tmp_path / "out" / ".dhtorch" / "unfinished" / "7.parquet"
-    left.parent.mkdir(parents=True)
-    left.write_bytes(b"PAR1")
-    assert made().code == 0 and not left.exists()
-
-
 def test_a_file_at_a_shards_place_that_dhtorch_did_not_write_is_refused_before_any_row(made, tmp_path):
     foreign = tmp_path / "out" / "shard-00001.parquet"
     foreign.parent.mkdir()
@@ -75,11 +68,6 @@ def test_a_file_at_a_shards_place_that_dhtorch_did_not_write_is_refused_before_a
     with pytest.raises(FileExistsError, match=r"shard-00001\.parquet.*dhtorch did not write"):
         made(recording(9, load=loaded.append, gap=1))
     assert foreign.read_bytes() == b"foreign" and not loaded
-
-
-def test_one_recording_need_not_be_a_list(made):
-    done = made(recording(3), options={"gap": 0})
-    assert done.said.startswith(f"{done.folder}: 1 shard, 3 rows") and "3 no second view" in done.said
 
 
 def test_options_reach_the_rows(made):
@@ -98,17 +86,35 @@ def test_options_reach_the_rows(made):
         made(bad, out="bad", options={"gap": 0})
 
 
-def test_the_same_question_is_answered_once(made):
+def test_the_same_extraction_is_made_once(made, monkeypatch):
+    left = made(out="empty", options={"gap": 0}).folder.parent / "out" / ".dhtorch" / "unfinished" / "7.parquet"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"PAR1")  # of a killed run
+    real, calls = shards.write_shard, []
+
+    def interrupted(*args):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shards, "write_shard", interrupted)
+        words = r"^1 of 2 shards in .*out are complete and stay; run the same command again"
+        with pytest.raises(KeyboardInterrupt, match=words):
+            made()
     first = made()
+    assert "2 shards (1 left untouched), 6 rows" in first.said and not left.exists()
     before = bytes_of(first.folder)
     torn = shards.shard_files(first.folder)[1]
     torn.write_bytes(torn.read_bytes()[:-100])
     again = made()
     assert "2 shards (1 left untouched), 6 rows" in again.said and again.shown == [("6 frames", 2)]
     assert bytes_of(first.folder) == before and [p.name for p in (first.folder / ".dhtorch").iterdir()] == ["manifest"]
-    third = made()
-    assert "2 shards (2 left untouched), 6 rows" in third.said and "2 no second view" in third.said
-    assert third.shown == [], "nothing is asked for"
+    for changes in ({}, {"options": {"address": "head:1"}}, {"traceback": True}):  # where and how fast rows are made
+        third = made(**changes)
+        assert "2 shards (2 left untouched), 6 rows" in third.said and "2 no second view" in third.said
+        assert third.shown == [], "nothing is computed"
 
 
 @pytest.mark.parametrize(
@@ -131,12 +137,6 @@ def test_another_question_is_not_mixed_in(made, changes, said):
     with pytest.raises(FileExistsError, match=said):
         made(**changes)
     assert bytes_of(folder) == before
-
-
-def test_where_and_how_fast_rows_are_made_is_no_other_question(made):
-    made()
-    for changes in ({"options": {"address": "head:1"}}, {"traceback": True}):
-        assert "(2 left untouched)" in made(**changes).said
 
 
 def test_other_data_is_another_question(made, tmp_path):
@@ -182,57 +182,43 @@ def test_a_shard_tells_where_it_comes_from(made):
 BAD = {"load": Load(bad={1, 2}), "numbers": [10, 11, 12, 13, 14]}
 
 
-def test_a_bad_frame_ends_the_run_unless_told_otherwise(made):
-    expected = r"^one, frame 11: position 1 is damaged \(set extract.on_error=skip or flag to continue with the other frames\)$"
-    with pytest.raises(SampleError, match=expected):
+def test_a_bad_frame_ends_the_run_or_is_skipped_or_flagged_counted_and_named(made):
+    words = r"^one, frame 11: position 1 is damaged \(set extract.on_error=skip or flag to continue with the other frames\)$"
+    with pytest.raises(SampleError, match=words):
         made([recording(**BAD)], options={"gap": 1, "shard_rows": 1})
-
-
-def test_skipped_and_flagged_frames_are_counted_and_said(made):
-    skipped = made([recording(**BAD)], out="skip", options={"gap": 1, "on_error": "skip"})
-    assert FeatureTable(skipped.folder).place["frame_index"].tolist() == [10, 13, 14]
-    assert ", 3 rows," in skipped.said and "frames with a problem: 2 no second view, 2 skipped\n" in skipped.said
-    assert skipped.said.endswith("  one, frame 11: position 1 is damaged\n  one, frame 12: position 2 is damaged\n")
-    flagged = made([recording(**BAD)], out="flag", options={"gap": 1, "on_error": "flag"})
-    assert ", 5 rows," in flagged.said and "frames with a problem: 2 no second view, 2 unreadable\n" in flagged.said
-    rows = list(FeatureTable(flagged.folder))
-    assert [int(row["dhtorch.problem"]) for row in rows] == [1, 3, 3, 1, 0]
-    assert FeatureTable(flagged.folder).place["frame_index"].tolist() == [10, 11, 12, 13, 14]
-    assert all(not v.any() for k, v in rows[1].items() if k != "dhtorch.problem")
-
-
-def test_only_three_bad_frames_are_named(made):
-    many = made([recording(6, load=Load(bad={0, 1, 2, 3}))], options={"gap": 0, "on_error": "skip"})
-    assert many.said.count("is damaged") == 3 and many.said.endswith("  and 1 more\n")
-    three = made([recording(6, load=Load(bad={0, 1, 2}))], out="three", options={"gap": 0, "on_error": "skip"})
-    assert three.said.count("is damaged") == 3 and "more" not in three.said
-
-
-def test_an_interrupted_run_says_what_stays(made, monkeypatch):
-    real, calls = shards.write_shard, []
-
-    def interrupted(*args):
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*args)
-
-    monkeypatch.setattr(shards, "write_shard", interrupted)
-    with pytest.raises(
-        KeyboardInterrupt, match=r"^1 of 2 shards in .*out are complete and stay; run the same command again"
+    for on_error, kept, problems in (
+        ("skip", [10, 13, 14], [1, 1, 0]),
+        ("flag", [10, 11, 12, 13, 14], [1, 3, 3, 1, 0]),
     ):
-        made()
-    assert "1 left untouched" in made().said
+        done = made([recording(**BAD)], out=on_error, options={"gap": 1, "on_error": on_error})
+        features = FeatureTable(done.folder)
+        assert features.place["frame_index"].tolist() == kept and f", {len(kept)} rows," in done.said
+        name = "skipped" if on_error == "skip" else "unreadable"
+        assert f"frames with a problem: 2 no second view, 2 {name}\n" in done.said
+        assert done.said.endswith("  one, frame 11: position 1 is damaged\n  one, frame 12: position 2 is damaged\n")
+        rows = list(features)
+        assert [int(row["dhtorch.problem"]) for row in rows] == problems
+        for row in rows:
+            if row.pop("dhtorch.problem") == 3:
+                assert not any(v.any() for v in row.values())
+    for n, more in ((4, "  and 1 more\n"), (3, "position 2 is damaged\n")):  # only three are named
+        done = made([recording(6, load=Load(bad=set(range(n))))], out=str(n), options={"gap": 0, "on_error": "skip"})
+        assert done.said.count("is damaged") == 3 and done.said.endswith(more)
 
 
-def test_the_folder_and_the_workers_are_checked_first(made, tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"out": "file"}, r"out: .*file is a file, expected a folder or a new path"),
+        *(({"workers": n}, f"workers: found {n}, expected a whole number of at least 0") for n in (-1, 1.5, None)),
+        ({"options": {"tokens_hw": (7, 7)}}, "found an image of 7x7, expected at least one patch of 14"),
+    ],
+)
+def test_the_folder_and_the_workers_are_checked_first(changes, words, made, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError, match=r"out: .*file is a file, expected a folder or a new path"):
-        made(out="file")
-    for workers in (-1, 1.5, None):
-        with pytest.raises(ValueError, match=f"workers: found {workers}, expected a whole number of at least 0"):
-            made(workers=workers)
-    with pytest.raises(ValueError, match="found an image of 7x7, expected at least one patch of 14"):
-        made(options={"tokens_hw": (7, 7)})
+    with pytest.raises((ValueError, NotADirectoryError), match=words):
+        made(**changes)
     assert not (tmp_path / "out").exists()
-    assert made(out="deep/er").code == 0 and (tmp_path / "deep" / "er" / "shard-00000.parquet").exists()
+    done = made(recording(3), out="deep/er", options={"gap": 0})  # one recording need not be a list
+    assert done.code == 0 and (tmp_path / "deep" / "er" / "shard-00000.parquet").exists()
+    assert done.said.startswith(f"{done.folder}: 1 shard, 3 rows") and "3 no second view" in done.said

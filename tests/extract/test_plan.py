@@ -13,8 +13,9 @@ from support.stub_samples import FixedEstimate, H, K, N, Stub, W, added, tiny
 
 from dhtorch import extract
 from dhtorch.extract import columns, plan
-from dhtorch.extract.dataset import RowDataset
+from dhtorch.extract.dataset import RowDataset, common_map_hw
 from dhtorch.records import Camera, Frame
+from dhtorch.transforms import DenseMaps
 
 
 class Seen:
@@ -35,59 +36,53 @@ def forgotten():
 # ---------------------------------------------------------------------------------------------------- the plan
 
 
-def test_positions_and_places():
+def test_positions_places_and_shards():
     whole = plan.ExtractionPlan(order=(2, 0, 1), episodes=(0, 4, 9), ends=(3, 4, 8), roots={})
-    assert len(whole) == 8
-    assert [whole.place(i) for i in range(8)] == [
-        (2, 0, 0),
-        (2, 0, 1),
-        (2, 0, 2),
-        (0, 4, 0),
-        *((1, 9, i) for i in range(4)),
-    ]
-
-
-def test_shards_cut_the_rows_in_equal_pieces():
-    whole = plan.ExtractionPlan(order=(0,), episodes=(0,), ends=(8,), roots={})
+    places = [*((2, 0, i) for i in range(3)), (0, 4, 0), *((1, 9, i) for i in range(4))]
+    assert len(whole) == 8 and [whole.place(i) for i in range(8)] == places
     for size, pieces in ((3, [3, 3, 2]), (4, [4, 4]), (8, [8]), (9, [8]), (1, [1] * 8)):
         shards = whole.shards(size)
         assert [len(s.rows) for s in shards] == pieces and [i for s in shards for i in s.rows] == list(range(8))
         assert [(s.number, s.of) for s in shards] == [(k, len(pieces)) for k in range(len(pieces))]
+    assert [len(s.rows) for s in whole.shards(3, apart=True)] == [3, 1, 3, 1]
     assert [s.name for s in whole.shards(3)] == [f"shard-0000{k}.parquet" for k in range(3)]
     assert plan.ShardSpec(123, 200, range(1)).name == "shard-00123.parquet"
 
 
-def test_the_plan_is_sorted_by_episode():
-    made = plan.make_plan(
-        [recording(2, name="c", episode=5), recording(3, name="a", episode=1), recording(4, name="b", episode=0)], 1, 1
-    )
-    assert (made.order, made.episodes, made.ends) == ((2, 1, 0), (0, 1, 5), (4, 7, 9))
+def test_the_plan_is_sorted_by_episode_and_names_its_folders_once():
+    given = [(2, "c", 5, "/b"), (3, "a", 1, None), (4, "b", 0, "/a"), (1, "d", 7, "/b")]
+    made = plan.make_plan([recording(n, name=x, episode=e, root=r and Path(r)) for n, x, e, r in given], 1, 1)
+    assert (made.order, made.episodes, made.ends) == ((2, 1, 0, 3), (0, 1, 5, 7), (4, 7, 9, 10))
+    assert [*made.roots.items()] == [(Path("/b"), None), (Path("/a"), None)]
     unnumbered = plan.make_plan([recording(2), recording(3, name="two")], 0, 1)
     assert (unnumbered.order, unnumbered.episodes, unnumbered.ends) == ((0, 1), (0, 1), (2, 5))
-
-
-def test_roots_are_named_once_in_order():
-    roots = [Path("/b"), None, Path("/a"), Path("/b")]
-    made = plan.make_plan([recording(root=r, name=str(k)) for k, r in enumerate(roots)], 0, 1)
-    assert [*made.roots.items()] == [(Path("/b"), None), (Path("/a"), None)]
-
-
-def test_two_recordings_of_one_episode_are_refused():
     with pytest.raises(ValueError, match="data: left and right are one episode, expected one camera of it"):
-        plan.make_plan(
-            [recording(name="left", episode=3), recording(name="x"), recording(name="right", episode=3)], 0, 1
-        )
+        plan.make_plan([recording(name=x, episode=e) for x, e in (("left", 3), ("x", None), ("right", 3))], 0, 1)
 
 
-def test_steps_go_back_by_the_gap_evenly_for_many_views():
-    own, none = SimpleNamespace(name="r", gap=7), SimpleNamespace(name="r", gap=None)
-    assert plan.view_offsets(own, 3, 1) == [3] and plan.view_offsets(own, None, 1) == [7]
-    assert plan.view_offsets(own, 0, 1) == plan.view_offsets(none, 0, 3) == []
-    assert plan.view_offsets(own, 6, 3) == [2, 4, 6] and plan.view_offsets(own, None, 2) == [4, 7]
-    with pytest.raises(ValueError, match=r"extract\.gap: r has no gap of its own, expected a number.*0 = front end"):
-        plan.view_offsets(none, None, 1)
-    with pytest.raises(ValueError, match="views: found 4"):
-        plan.make_plan([recording(gap=3)], None, 4)
+@pytest.mark.parametrize(
+    ("own", "gap", "views", "steps"),
+    [
+        (7, 3, 1, [3]),
+        (7, None, 1, [7]),
+        (7, 0, 1, []),
+        (None, 0, 3, []),
+        (7, 6, 3, [2, 4, 6]),
+        (7, None, 2, [4, 7]),
+        (None, None, 1, None),
+    ],
+)
+def test_steps_go_back_by_the_gap_evenly_for_many_views(own, gap, views, steps):
+    scene = SimpleNamespace(name="r", gap=own)
+    if steps is None:
+        with pytest.raises(
+            ValueError, match=r"extract\.gap: r has no gap of its own, expected a number.*0 = front end"
+        ):
+            plan.view_offsets(scene, gap, views)
+        with pytest.raises(ValueError, match="views: found 4"):
+            plan.make_plan([recording(gap=3)], None, 4)
+        return
+    assert plan.view_offsets(scene, gap, views) == steps
 
 
 # ---------------------------------------------------------------------------------------------------- rows
@@ -110,10 +105,9 @@ def test_a_row_looks_back_by_frame_number_inside_its_episode():
     assert pairs == {(1, 2): [50, 52], (3, 2): [10, 12], (3, 7): [13, 15]}
 
 
-def test_a_row_says_where_it_belongs():
-    made = rows(
-        [recording(numbers=[4, 9], times=torch.tensor([0.5, 2.5], dtype=torch.float64), name="x", episode=7)], 0
-    )
+def test_a_row_states_where_it_belongs():
+    times = torch.tensor([0.5, 2.5], dtype=torch.float64)
+    made = rows([recording(numbers=[4, 9], times=times, name="x", episode=7)], 0)
     assert len(made) == 2
     assert made[1].place == {"episode_index": 7, "frame_index": 9, "timestamp": 2.5, "recording": "x"}
     assert list(made[0].place) == list(columns.KEY_COLUMNS) and made[0].complaint == ""
@@ -160,12 +154,10 @@ def test_a_method_is_given_what_the_frames_know():
 
 def test_what_readers_give_is_trusted():
     """Metres and intrinsics are the readers' own: no depth is too far, no principal point too far off, no field too wide."""
-    far = Frame(
-        frame(1).image, 5000 + frame(1).depth, Camera(torch.tensor([[30.0, 30]]), torch.tensor([[400.0, -300]]))
-    )
-    near = far.replace(depth=far.depth * 1e-8)
-    wide = far.replace(camera=far.camera.replace(f=torch.full((1, 2), 0.02)))
-    for odd in (far, near, wide):
+    camera = Camera(torch.tensor([[30.0, 30]]), torch.tensor([[400.0, -300]]))
+    far = Frame(frame(1).image, 5000 + frame(1).depth, camera)
+    wide = far.replace(camera=camera.replace(f=torch.full((1, 2), 0.02)))
+    for odd in (far, far.replace(depth=far.depth * 1e-8), wide):
         assert rows([recording(load=lambda i, odd=odd: odd)], 0)[0].features is not None
 
 
@@ -225,24 +217,53 @@ def test_rows_are_the_same_in_any_order_and_after_a_pickle():
 # ---------------------------------------------------------------------------------------------------- options, the run
 
 
-def test_options_of_an_extraction_are_checked():
-    for options, message in (
-        ({"engine": "dask"}, "extract.engine: found 'dask', expected one of local, ray"),
-        ({"on_error": "ignore"}, "extract.on_error: found 'ignore', expected one of raise, skip, flag"),
-        ({"fit": "squash"}, "extract.fit: found 'squash', expected one of stretch, pad, crop"),
-        ({"gap": -1}, "extract.gap: found -1, expected a whole number of at least 0"),
-        ({"gap": 1.5}, "extract.gap: found 1.5"),
-        ({"gap": "car"}, "extract.gap: found 'car'"),
-        ({"patch": 0}, "extract.patch: found 0, expected a whole number of at least 1"),
-        ({"patch": None}, "extract.patch: found None"),
-        ({"shard_rows": 0}, "extract.shard_rows: found 0, expected a whole number of at least 1"),
-        ({"shard_rows": None}, "extract.shard_rows: found None"),
-        ({"tokens_hw": None}, "extract.tokens_hw: found None, expected height and width"),
-        ({"tokens_hw": (1, 2, 3)}, "extract.tokens_hw: found"),
-        ({"tokens_hw": 224}, "extract.tokens_hw: found 224"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            extract.ExtractOptions(**options)
-    assert (
-        extract.ExtractOptions(gap=0, patch=1, shard_rows=1).gap == 0 and extract.ExtractOptions(gap=None).gap is None
-    )
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("engine", "dask", "found 'dask', expected one of local, ray"),
+        ("on_error", "ignore", "found 'ignore', expected one of raise, skip, flag"),
+        ("fit", "squash", "found 'squash', expected one of stretch, pad, crop"),
+        *(("gap", x, f"found {x!r}, expected a whole number of at least 0") for x in (-1, 1.5, "car")),
+        *(
+            (name, x, f"found {x}, expected a whole number of at least 1")
+            for name in ("patch", "shard_rows")
+            for x in (0, None)
+        ),
+        *(("tokens_hw", x, r"found .*, expected height and width") for x in (None, (1, 2, 3), 224)),
+        ("dense", {"sise": 48}, "found 'sise', expected some of source_views"),
+    ],
+)
+def test_options_of_an_extraction_are_checked(option, value, message):
+    with pytest.raises(ValueError, match=f"extract.{option}: {message}"):
+        extract.ExtractOptions(**{option: value})
+    assert extract.ExtractOptions(gap=0, patch=1, shard_rows=1, dense=True).gap == 0
+    assert extract.ExtractOptions(gap=None).gap is None
+
+
+class OtherSize(Load):
+    """Frames whose image is wider from a position on."""
+
+    def __init__(self, first_wide, **options):
+        super().__init__(**options)
+        self.first_wide = first_wide
+
+    def __call__(self, i):
+        one = super().__call__(i)
+        if i < self.first_wide:
+            return one
+        return one.replace(image=one.image.repeat(1, 1, 1, 2), depth=one.depth.repeat(1, 1, 2))
+
+
+def test_maps_have_one_size_in_all_recordings_and_frames():
+    """Refused before the work, or a frame that cannot be read."""
+    small, wide = recording(2, load=Load(bad={0})), recording(2, name="two", load=OtherSize(0))
+    assert common_map_hw([small, recording(3)], DenseMaps.from_options({"size": 21})) == (14, 21)
+    words = "extract.dense: two has pictures of 28x84 and maps of 11x32, expected maps of 21x32 as of one; extract them"
+    with pytest.raises(ValueError, match=words):
+        common_map_hw([small, wide], DenseMaps.from_options({"size": 32}))
+    with pytest.raises(ValueError, match="found no frame that can be read"):
+        common_map_hw([recording(2, load=Load(bad={0, 1}))], DenseMaps.from_options(True))
+    wanted = columns.feature_columns(6, 6, map_hw=(14, 21))
+    made = rows([recording(2, load=OtherSize(1))], 0, wanted=wanted, dense={"size": 21})
+    assert made[0].features["depth_map"].shape == (14, 21) and made[1].features is None
+    assert "one, frame 1: depth_map: found 7x21, expected 14x21 as of the first frame" in made[1].complaint

@@ -20,7 +20,7 @@ from dhtorch.data import FormatError
 from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.extract.dataset import ExtractedRow
 from dhtorch.extract.plan import ShardSpec
-from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, SampleError, SampleProblem
+from dhtorch.transforms import TOKEN_CHANNELS, SampleError, SampleProblem
 
 N, P = 5, 6
 SHARED = {
@@ -37,11 +37,10 @@ SHARED = {
 def row(k, wanted=None, episode=0, problem=0):
     rng = np.random.default_rng(k)
     found = columns.feature_columns(N, P) if wanted is None else wanted
-    values = {}
-    for name, column in found.items():
-        values[name] = (
-            rng.integers(0, 2, column.shape) if column.kind in ("uint8", "bool") else rng.normal(size=column.shape)
-        )
+    values = {
+        name: rng.integers(0, 2, c.shape) if c.kind in ("uint8", "bool") else rng.normal(size=c.shape)
+        for name, c in found.items()
+    }
     place = {"episode_index": episode, "frame_index": k, "timestamp": k / 10, "recording": f"r{episode}"}
     return {**values, **place, "problem": problem}
 
@@ -94,21 +93,7 @@ def test_columns_have_the_shapes_types_and_units_that_they_are_known_by():
     assert all(half[k] == found[k]._replace(kind="float16") for k in half if half[k] != found[k])
 
 
-def test_every_key_of_the_transform_has_a_column():
-    lost = {"image": torch.zeros(3, 28, 42), "depth": "x"}
-    extender = ExtendDepth(depth_unit="m", n=N, on_error="flag", prefix="far.")
-    with pytest.warns(UserWarning, match="flagged"):
-        blank = {k.removeprefix("far."): v for k, v in extender(lost).items() if k not in lost}
-    found = columns.feature_columns(N, P)
-    assert set(found) == set(columns.KEY_COLUMNS) | set(blank)
-    kinds = {torch.float32: "float32", torch.bool: "bool", torch.int32: "uint8"}
-    assert {k: (found[k].shape, found[k].kind) for k in blank} == {
-        k: (tuple(v.shape), kinds[v.dtype]) for k, v in blank.items()
-    }
-
-
 def test_codes_fit_a_byte_and_are_named():
-    tables = columns.code_tables()
     wanted = {
         "source": Source,
         "flag": Flag,
@@ -116,28 +101,26 @@ def test_codes_fit_a_byte_and_are_named():
         "gate": Gate,
         "pose_code": PoseCode,
         "problem": SampleProblem,
-        "source_map": Source,
-        "gate_map": Gate,
-        "cause_map": Cause,
     }
+    wanted |= {"source_map": Source, "gate_map": Gate, "cause_map": Cause}
+    tables = columns.code_tables()
     assert tables == {k: names(t) for k, t in wanted.items()}
     assert sum(tables["flag"]) == 255 and max(max(t) for t in tables.values()) == 128
-    assert tables["problem"] == {0: "NONE", 1: "NO_SECOND_VIEW", 2: "NO_DEPTH", 3: "UNREADABLE"}
 
 
 def test_chosen_columns_keep_place_problem_and_order():
-    found = columns.feature_columns(N, P)
+    every = columns.feature_columns(N, P)
     place = ["episode_index", "frame_index", "timestamp", "recording"]
-    assert list(columns.select_columns(found, None)) == list(found) and list(columns.KEY_COLUMNS) == place
-    assert list(columns.select_columns(found, ["tokens", "uv"])) == [*place, "uv", "tokens", "problem"]
-    assert list(columns.select_columns(found, [])) == [*place, "problem"]
+    for wanted, kept in (
+        (None, list(every)),
+        (["tokens", "uv"], [*place, "uv", "tokens", "problem"]),
+        ([], [*place, "problem"]),
+    ):
+        assert list(columns.select_columns(every, wanted)) == kept
     with pytest.raises(
         ValueError, match=r"extract\.columns: found 'colour', expected some of episode_index, .*problem$"
     ):
-        columns.select_columns(found, ["uv", "colour"])
-
-
-def test_a_blank_row_is_zeros_and_a_problem():
+        columns.select_columns(every, ["uv", "colour"])
     blank = columns.blank_features(
         columns.select_columns(columns.feature_columns(N, P, half=True), ["xyz", "pose_ok", "gate"])
     )
@@ -187,40 +170,24 @@ def test_a_shard_says_what_it_holds(tmp_path):
     assert json.loads(metadata.metadata[b"dhtorch"]) == SHARED
 
 
-def test_rows_are_stored_in_groups_of_sixteen(tmp_path):
-    few = columns.select_columns(columns.feature_columns(N, P), ["pose_ok"])
-    shards.write_shard(
-        tmp_path, ShardSpec(0, 1, range(35)), (row(k, few) for k in range(35)), few, SHARED | {"columns": few}
+@pytest.mark.parametrize(
+    ("map_hw", "n", "groups"), [(None, 35, [16, 16, 3]), ((480, 640), 7, [3, 3, 1]), ((2160, 3840), 2, [1, 1])]
+)
+def test_rows_are_stored_in_groups_of_sixteen_or_fewer_where_maps_are_large(map_hw, n, groups, tmp_path, monkeypatch):
+    """16 MB at most are held at once."""
+    wanted = columns.feature_columns(N, P, map_hw=map_hw)
+    few = columns.select_columns(wanted, ["pose_ok"])
+    sizes, write = [], columns.arrow_table
+    monkeypatch.setattr(
+        shards, "arrow_table", lambda rows, _, layout: sizes.append(len(rows)) or write(rows, few, layout)
     )
+    monkeypatch.setattr(shards, "arrow_schema", lambda _, metadata: columns.arrow_schema(few, metadata))
+    shared = SHARED | {"columns": dict.fromkeys(few)}
+    shards.write_shard(tmp_path, ShardSpec(0, 1, range(n)), (row(k, few) for k in range(n)), wanted, shared)
     metadata = parquet.read_metadata(tmp_path / "shard-00000.parquet")
-    assert [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)] == [16, 16, 3]
+    assert sizes == groups == [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)]
     features = FeatureTable(tmp_path)
-    for k in (0, 15, 16, 31, 32, 34):
-        assert features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"])
-
-
-def test_halves_and_fewer_columns_are_smaller_files(tmp_path):
-    whole, half = columns.feature_columns(N, P), columns.feature_columns(N, P, half=True)
-    few = columns.select_columns(half, ["tokens"])
-    size = [
-        sum(
-            p.stat().st_size
-            for p in shards.shard_files(written(tmp_path / name, [[row(k) for k in range(16)]], wanted))
-        )
-        for name, wanted in (("whole", whole), ("half", half), ("few", few))
-    ]
-    numbers = [
-        sum(np.dtype(c.kind).itemsize * int(np.prod(c.shape)) for c in wanted.values() if np.dtype(c.kind).kind == "f")
-        for wanted in (whole, half, few)
-    ]
-    for k in (0, 1):  # noise of double precision cannot be packed: what a narrower row lacks, its file lacks
-        assert size[k] - size[k + 1] > 0.8 * 16 * (numbers[k] - numbers[k + 1]) > 0
-
-
-def test_the_same_rows_are_the_same_bytes(tmp_path):
-    one, two = (written(tmp_path / name, [[row(0), row(1)], [row(2)]]) for name in "ab")
-    for path in shards.shard_files(one):
-        assert path.read_bytes() == (two / path.name).read_bytes()
+    assert all(features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"]) for k in range(n))
 
 
 def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
@@ -236,12 +203,12 @@ def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
 
 
 def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):
-    folder = written(tmp_path / "out", [[row(0)], [row(1, problem=1), row(2)], [row(3)]])
-    assert shards.find_finished_shards(folder, SHARED) == {
-        "shard-00000.parquet": Counter(none=1),
-        "shard-00001.parquet": Counter(none=1, no_second_view=1),
-        "shard-00002.parquet": Counter(none=1),
-    }
+    pieces = [[row(0)], [row(1, problem=1), row(2)], [row(3)]]
+    folder, twin = (written(tmp_path / name, pieces) for name in ("out", "twin"))
+    assert [p.read_bytes() for p in shards.shard_files(folder)] == [p.read_bytes() for p in shards.shard_files(twin)]
+    finished = shards.find_finished_shards(folder, SHARED)
+    assert list(finished) == [f"shard-0000{k}.parquet" for k in range(3)]
+    assert [*finished.values()] == [Counter(none=1), Counter(none=1, no_second_view=1), Counter(none=1)]
     torn = folder / "shard-00001.parquet"
     torn.write_bytes(torn.read_bytes()[:-50])
     assert sorted(shards.find_finished_shards(folder, SHARED)) == ["shard-00000.parquet", "shard-00002.parquet"]
@@ -323,18 +290,25 @@ def test_a_rewritten_file_is_read_again(tmp_path):
     assert torch.equal(FeatureTable(folder)[0]["dhtorch.depth"], torch.full((N,), 8.0))
 
 
-def test_a_folder_without_a_whole_extraction_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="shards: found none, expected a folder written by dhtorch extract"):
-        FeatureTable(tmp_path)
-    folder = written(tmp_path / "out", [[row(0)], [row(1)]], of=3)
-    with pytest.raises(
-        FormatError, match="shards: found 2, expected 3: run the same dhtorch extract again for the missing"
-    ):
-        FeatureTable(folder)
-    whole = written(tmp_path / "whole", [[row(0)]])
-    for wrong in ("colour", "timestamp"):
-        with pytest.raises(FormatError, match=f"columns: found {wrong}, expected some of uv, xyz, .*problem$"):
-            FeatureTable(whole, ["uv", wrong])
+@pytest.mark.parametrize(
+    ("pieces", "of", "wanted", "words"),
+    [
+        ([], None, None, "shards: found none, expected a folder written by dhtorch extract"),
+        (
+            [[row(0)], [row(1)]],
+            3,
+            None,
+            "shards: found 2, expected 3: run the same dhtorch extract again for the missing",
+        ),
+        *(
+            ([[row(0)]], None, ["uv", name], f"columns: found {name}, expected some of uv, xyz, .*problem$")
+            for name in ("colour", "timestamp")
+        ),
+    ],
+)
+def test_a_folder_without_a_whole_extraction_is_refused(pieces, of, wanted, words, tmp_path):
+    with pytest.raises(FormatError, match=words):
+        FeatureTable(written(tmp_path / "out", pieces, of=of), wanted)
 
 
 def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
@@ -345,21 +319,13 @@ def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
     ]
     joined = JoinedDataset(items, features)
     assert len(joined) == 2 and joined[0]["x"] == 1 and joined[1].keys() == {*items[1], "dhtorch.depth"}
-    assert torch.equal(joined[1]["dhtorch.depth"], features[1]["dhtorch.depth"])
+    wanted = [features[2]["dhtorch.depth"], features[1]["dhtorch.depth"]]
+    loaded = torch.utils.data.DataLoader(joined, batch_size=None, num_workers=1, multiprocessing_context="fork")
+    assert all(torch.equal(item["dhtorch.depth"], x) for item, x in zip(loaded, wanted, strict=True))
     nested = JoinedDataset([{"m": {"e": 0, "f": 1}}], features, episode_key="m.e", frame_key="m/f")
-    assert torch.equal(nested[0]["dhtorch.depth"], features[1]["dhtorch.depth"])
+    assert torch.equal(nested[0]["dhtorch.depth"], wanted[1])
     with pytest.raises(KeyError, match="frame 5 of episode 0"):
         JoinedDataset([{"episode_index": 0, "frame_index": 5}], features)[0]
-
-
-def test_a_joined_data_set_goes_through_a_loader(tmp_path):
-    features = FeatureTable(written(tmp_path / "out", [[row(k) for k in range(4)]]), ["tokens", "tokens_valid"])
-    joined = JoinedDataset([{"episode_index": 0, "frame_index": k} for k in (3, 1, 0, 2)], features)
-    (batch,) = torch.utils.data.DataLoader(joined, batch_size=4, num_workers=1, multiprocessing_context="fork")
-    assert batch["dhtorch.tokens"].shape == (4, P, 10) and batch["frame_index"].tolist() == [3, 1, 0, 2]
-    assert all(
-        torch.equal(batch["dhtorch.tokens"][k], features[i]["dhtorch.tokens"]) for k, i in enumerate((3, 1, 0, 2))
-    )
 
 
 # ---------------------------------------------------------------------------------------------------- engines
@@ -372,7 +338,9 @@ class Counted(torch.utils.data.Dataset):
         return 50
 
     def __getitem__(self, i):
-        return ExtractedRow({"at": i, "threads": torch.get_num_threads()}, None, str(i))
+        if i == 60:
+            raise RuntimeError("shapes do not fit")
+        return ExtractedRow({"at": i, "threads": torch.get_num_threads()}, {"depth": np.full(3, i)}, str(i))
 
 
 class Ray:
@@ -417,51 +385,38 @@ def ray(monkeypatch):
     return fake
 
 
-def test_answers_come_in_the_order_of_their_positions():
-    order = [7, 3, 3, 20]
-    answers = list(engines.run_local(Counted(), order, 0))
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_answers_come_in_the_order_of_their_positions_as_they_are(engine, ray):
+    order = [7, 3, 3, 20, *range(49, 9, -1)]
+    answers = list(engines.run_engine(engine, Counted(), order, workers=0))
     assert [a.place["at"] for a in answers] == order and {a.place["threads"] for a in answers} == {1}
-    assert all(type(a) is ExtractedRow and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
+    assert all(type(a) is ExtractedRow and a.complaint == str(a.place["at"]) for a in answers)
+    assert all(a.features["depth"].tolist() == [a.place["at"]] * 3 for a in answers)
+    with pytest.raises(RuntimeError, match=r"^shapes do not fit"):
+        list(engines.run_engine(engine, Counted(), [60], workers=0))
+    assert ray.log == [] or [name for name, _ in ray.log] == ["init", "blocks", "shutdown"] * 2
 
 
-def test_unreadable_frames_stop_are_left_out_or_blank():
-    wanted = columns.feature_columns(N, P)
+@pytest.mark.parametrize(("on_error", "kept"), [("raise", None), ("skip", [1]), ("flag", [0, 1])])
+def test_unreadable_frames_end_the_run_are_left_out_or_blank(on_error, kept):
     answers = [
         ExtractedRow({"frame_index": 0}, None, "frame 0 is damaged"),
         ExtractedRow({"frame_index": 1}, {"problem": 0}),
     ]
-    rows = SimpleNamespace(wanted=wanted)
-    with pytest.raises(SampleError, match=r"frame 0 is damaged \(set extract.on_error=skip or flag to continue"):
-        list(engines.filter_rows(answers, "raise", rows, []))
-    complaints = []
-    assert list(engines.filter_rows(answers, "skip", rows, complaints)) == [{"frame_index": 1, "problem": 0}]
-    assert complaints == ["frame 0 is damaged"]
-    blank, whole = engines.filter_rows(answers, "flag", rows, [])
-    assert blank["frame_index"] == 0 and blank["problem"] == SampleProblem.UNREADABLE and whole["frame_index"] == 1
+    complaints, rows = [], SimpleNamespace(wanted=columns.feature_columns(N, P))
+    if kept is None:
+        with pytest.raises(SampleError, match=r"frame 0 is damaged \(set extract.on_error=skip or flag to continue"):
+            list(engines.filter_rows(answers, on_error, rows, complaints))
+        return
+    written_rows = list(engines.filter_rows(answers, on_error, rows, complaints))
+    assert [r["frame_index"] for r in written_rows] == kept and complaints == ["frame 0 is damaged"]
+    assert [int(r["problem"]) for r in written_rows] == [3 * (k == 0) for k in kept]
 
 
-def test_arrays_of_an_answer_come_as_they_are():
-    class Arrays(Counted):
-        def __getitem__(self, i):
-            return super().__getitem__(i)._replace(features={"depth": np.full(3, i)})
-
-    (answer,) = engines.run_local(Arrays(), [2], 0)
-    assert type(answer.features["depth"]) is np.ndarray and answer.features["depth"].tolist() == [2, 2, 2]
-
-
-def test_an_error_that_is_no_dead_worker_stays_what_it_is():
-    class Broken(Counted):
-        def __getitem__(self, i):
-            raise RuntimeError("shapes do not fit")
-
-    with pytest.raises(RuntimeError, match=r"^shapes do not fit"):
-        list(engines.run_local(Broken(), [0], 0))
-
-
-def test_ray_is_given_blocks_and_gives_the_same_answers(ray):
-    order = list(range(49, 9, -1))
-    answers = list(engines.run_ray(Counted(), order, None))
-    assert [a.place["at"] for a in answers] == order and all(type(a) is ExtractedRow for a in answers)
+def test_ray_is_given_blocks_of_sixteen_and_left_when_a_reader_stops_early(ray):
+    answers = engines.run_ray(Counted(), range(40), None)
+    assert next(answers).place["at"] == 0
+    answers.close()
     assert [name for name, _ in ray.log] == ["init", "blocks", "shutdown"] and ray.log[1][1] == [16, 16, 8]
     options = ray.log[0][1]
     assert options["address"] is None and options["include_dashboard"] is False and options["log_to_driver"] is False
@@ -502,10 +457,3 @@ def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
     monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))
     with pytest.raises(ConnectionError, match=r"engine=ray: no node"):
         list(engines.run_ray(Counted(), [1], None))
-
-
-def test_ray_is_left_when_a_reader_stops_early(ray):
-    answers = engines.run_ray(Counted(), range(40), None)
-    assert next(answers).place["at"] == 0
-    answers.close()
-    assert ray.log[-1][0] == "shutdown"

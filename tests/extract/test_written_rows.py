@@ -42,25 +42,26 @@ def moving(first, name, n=M, **options):
     return recording(n, name=name, load=load, poses=Pose(se3.exp(turns).R, t), times=times, camera_name=name)
 
 
-@pytest.fixture(scope="module")
-def two_cameras(tmp_path_factory):
-    """Two cameras of one episode, their rows as a worker returns them, and these in shards."""
-    folder = tmp_path_factory.mktemp("shards")
-    scenes = [moving(0, "left"), moving(40, "right")]
-    views = {view.key: view for view in (DatasetCamera.of(scene, 64) for scene in scenes)}
+def written_cameras(folder, scenes, views, on_error="raise"):
+    """Rows of two cameras of one episode as a worker returns them, and their shards by camera."""
     whole, wanted = plan.make_plan(scenes, 1, 1, rigs=True), map_columns(pictures=True, n=N)
     method = Stub(answer=FixedEstimate(), n=N)
     rows = MapRowDataset(scenes, whole, wanted, method=method, gap=1, step=2**-10, views=views)
-    answers = [rows[k] for k in range(len(rows))]
-    assert not [row.complaint for row in answers if row.complaint]
-    parts = {}
+    answers, parts = [rows[k] for k in range(len(rows))], {}
     for key, first in zip(views, (0, M), strict=True):
         shard = plan.ShardSpec(first, 8, range(first, first + M))
-        write_shard(
-            folder, shard, ({**row.place, **row.features} for row in answers[first : first + M]), wanted, SHARED
-        )
+        write_shard(folder, shard, filter_rows(answers[first : first + M], on_error, rows, []), wanted, SHARED)
         parts[key] = [folder / shard.name]
-    return SimpleNamespace(scenes=scenes, views=views, rows=answers, parts=parts)
+    return answers, parts
+
+
+@pytest.fixture(scope="module")
+def two_cameras(tmp_path_factory):
+    scenes = [moving(0, "left"), moving(40, "right")]
+    views = {view.key: view for view in (DatasetCamera.of(scene, 64) for scene in scenes)}
+    rows, parts = written_cameras(tmp_path_factory.mktemp("shards"), scenes, views)
+    assert not [row.complaint for row in rows if row.complaint]
+    return SimpleNamespace(scenes=scenes, views=views, rows=rows, parts=parts)
 
 
 def test_a_row_is_that_of_its_own_frame(two_cameras):
@@ -105,23 +106,13 @@ def test_a_table_of_two_cameras_holds_what_each_of_them_saw_and_counts_on(two_ca
 @pytest.mark.parametrize("on_error", ["flag", "skip"])
 def test_an_instant_with_an_unreadable_frame_takes_no_row(on_error, two_cameras, tmp_path):
     broken = [moving(0, "left", bad={1}), moving(40, "right")]
-    views, wanted = two_cameras.views, map_columns(pictures=True, n=N)
-    whole = plan.make_plan(broken, 1, 1, rigs=True)
-    rows = MapRowDataset(
-        broken, whole, wanted, method=Stub(answer=FixedEstimate(), n=N), gap=1, step=2**-10, views=views
-    )
-    parts = {}
-    for key, first in zip(views, (0, M), strict=True):
-        read = list(filter_rows((rows[k] for k in range(first, first + M)), on_error, rows, [], "on_error"))
-        write_shard(tmp_path, plan.ShardSpec(first, 8, range(first, first + M)), read, wanted, SHARED)
-        parts[key] = [tmp_path / plan.ShardSpec(first, 8, range(0)).name]
-    target = lerobot(tmp_path / "out", views)
+    _, parts = written_cameras(tmp_path, broken, two_cameras.views, on_error)
+    target = lerobot(tmp_path / "out", two_cameras.views)
     assert target.assemble(0, [], parts)["length"] == M - 1
     table = parquet.read_table(target.file(0)).to_pydict()
     assert table["observation.frame_number"] == [0, *range(2, M)] and table["frame_index"] == list(range(M - 1))
-    pictures = [decode_image(cell["bytes"], "a cell") for cell in table["observation.images.right"]]
-    for picture, i in zip(pictures, (0, *range(2, M)), strict=True):
-        assert np.array_equal(picture, frame(40 + i).image[0].numpy())
+    for cell, i in zip(table["observation.images.right"], (0, *range(2, M)), strict=True):
+        assert np.array_equal(decode_image(cell["bytes"], "a cell"), frame(40 + i).image[0].numpy())
 
 
 @pytest.mark.parametrize("lens", [(), (0.11, -0.05, 0.003, -0.002, 0.01)])
@@ -144,32 +135,39 @@ def test_a_nerfstudio_folder_states_the_lens_and_the_pose_of_every_picture(two_c
 
 
 class Steps:
-    """An episode of 19 steps whose numbers name their step."""
+    """An episode of 19 steps whose numbers name their step; one feature is called as a column of every table."""
 
     n, instruction, about = 19, "text", {"split": "train", "number": 3}
     features: ClassVar = {
         "action": SimpleNamespace(kind="tensor", dtype="float32", shape=(2,)),
-        "reward": SimpleNamespace(kind="tensor", dtype="float32", shape=(1,)),
+        "timestamp": SimpleNamespace(kind="tensor", dtype="float32", shape=(1,)),
         "text": SimpleNamespace(kind="text"),
         "note": SimpleNamespace(kind="text"),
+        "observation/image_0": SimpleNamespace(kind="image"),
     }
 
     def values(self, name, steps):
         if name in ("text", "note"):
             return [f"{name} {i // 10}" for i in steps]
+        if name == "observation/image_0":
+            return [(b"\xff\xd8\xff\xe0", b"\x89PNG")[i % 2] for i in steps]
         size = self.features[name].shape[0]
         return np.stack([np.full(size, i, np.float32) + 100 * np.arange(size, dtype=np.float32) for i in steps])
 
 
 def test_every_step_of_a_robot_has_its_own_values():
-    tasks = ["text 1"]
+    tasks = ["text 1"]  # of an episode before
     source = RldsSource([None], [3], 10.0, cached={0: Steps()})
-    table = pa.concat_tables(source.batches(0, tasks)).to_pydict()
+    tables = list(source.batches(0, tasks))
+    assert [table.num_rows for table in tables] == [8, 8, 3]
+    table = pa.concat_tables(tables).to_pydict()
     assert table["action"] == [[float(i), 100.0 + i] for i in range(19)]
-    assert table["reward"] == [float(i) for i in range(19)]
+    assert table["source.timestamp"] == [float(i) for i in range(19)]
     assert table["frame_index"] == list(range(19))
     assert np.allclose(table["timestamp"], np.arange(19) / 10)
     assert tasks == ["text 1", "text 0"] and table["task_index"] == [1] * 10 + [0] * 9
     assert table["note"] == [f"note {i // 10}" for i in range(19)] and "text" not in table
+    ends = [cell["path"].rpartition(".")[2] for cell in table["observation.images.image_0"]]
+    assert ends == [("jpg", "png")[i % 2] for i in range(19)], "as they are encoded"
     few = pa.concat_tables(RldsSource([None], [3], 10.0, 11, {0: Steps()}).batches(0, [])).to_pydict()
     assert few["frame_index"] == list(range(11)) and few["action"][10] == [10.0, 110.0]
