@@ -22,7 +22,6 @@ import torch
 from dhtorch import data
 from dhtorch.codes import Gate, names
 from dhtorch.data.recording import Recording
-from dhtorch.experiments.baselines.frozen import AUTO_2
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO, MAP
@@ -37,7 +36,7 @@ NEAR_M = 0.5
 #: Stations in a row. Source: the note of the data set.
 ROW = 5
 
-METHODS: dict[str, Method] = {"map": MAP, "auto_2": AUTO_2, "auto": AUTO}
+METHODS: dict[str, Method] = {"map": MAP, "auto": AUTO}
 
 #: Uses of the arm's pose. Source: the ways in which a method takes a pose.
 USES: dict[str, Any] = {

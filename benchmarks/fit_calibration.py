@@ -1,8 +1,8 @@
 """Fit the calibration that travels with the package: what a score and a sigma of ``map`` turned out to be worth.
 
 python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/metrics/calibration/map.json
-python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
-python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
+python benchmarks/fit_calibration.py --method auto --seeds 2          the same of a method of several views, whose
+                                   thresholds nine scenes in ten keep, one by one
 python benchmarks/fit_calibration.py --method fused                of the joint answers at samples and at pixels, also
                                    of five built-in rooms with a phone's noise; four reference views a scene, one
                                    seed; writes dhtorch/metrics/calibration/fused.json

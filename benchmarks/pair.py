@@ -7,10 +7,10 @@ Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is se
 take turns in one process; errors are medians of the relative depth error over the same candidates. Rows
 ``per_far_answer`` are milliseconds per candidate answered within 5 %: their ratio turned over is how many times as many
 such answers ours gives in the same time. ``every_pixel`` is the same for ``complete``, whose answers are pixels,
-counted on every fourth row and column and multiplied by sixteen. ``auto_reference_view`` is ``auto`` beside the first
-release's
-``WINDOW_1``: one reference view, the same frames around it offered to both, from which each chooses. Mode ``compiled``
-is ours with the compiled code of ``python -m dhtorch.ops``, which the peer has too for the stages that it shares.
+counted on every fourth row and column and multiplied by sixteen. ``auto_reference_view`` is ``auto`` beside ``map``
+of five views (``window_1``): one reference view, the same frames around it offered to both, from which each chooses.
+Mode ``compiled`` is ours with the compiled code of ``python -m dhtorch.ops``, which the peer has too for the stages
+that it shares.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from dhtorch import data, pytree
 from dhtorch.codes import is_estimated
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import opencv
-from dhtorch.experiments.baselines.frozen import WINDOW_1
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth
@@ -200,7 +199,7 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
         median_rel[name] = errors.measure_errors(errors.points_from_estimate(estimate, truth))["median_rel"]
 
     sides = [partial(call, mode, with_view_selection(AUTO), mode) for mode in MODES]
-    sides.append(partial(call, "window_1", with_view_selection(WINDOW_1)))
+    sides.append(partial(call, "window_1", with_view_selection(MAP.replace(views=5))))
     *ours, peer = harness.in_turn(sides, repeats=options.repeats, clock=options.clock)
     rows = []
     for mode, times in zip(MODES, ours, strict=True):

@@ -47,18 +47,18 @@ EXPERIMENTS = {
     "untouched": f"experiment=method_comparison data=untouched {WITHOUT_SLOW} experiment.seeds=1",
     "untouched_dense": "experiment=dense_comparison data=untouched experiment.reference_views=3",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
-    "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.auto_2 ~experiment.methods.auto "
-    "~experiment.methods.fused",
-    "track_chain": "experiment=chain_study data=shared_scenes pairs.stride=6",
+    "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.auto ~experiment.methods.fused",
+    "track_chain": "experiment=method_comparison data=shared_scenes pairs.stride=6 experiment.seeds=1 "
+    "~experiment.methods.opencv ~experiment.methods.xfeat ~experiment.methods.auto ~experiment.methods.fused "
+    "+method@experiment.methods.paper_direct=paper_direct experiment.once=[kornia,paper_direct] "
+    "experiment.chained=[map] experiment.ratios={paper:paper_direct,map_chain:map}",
     "streams": f"experiment=method_comparison data=streams {WITHOUT_SLOW} experiment.seeds=2",
-    "part_ablation": "experiment=part_ablation data=shared_scenes",
-    "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
-    "views_study": "experiment=views_study data=shared_scenes experiment.reference_views=3",
-    "uncertainty_study": "experiment=uncertainty_study data=shared_scenes",
-    "uncertainty_study_streams": "experiment=uncertainty_study data=streams ~experiment.rooms",
+    "uncertainty_study": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=1 "
+    "experiment.disjoint=[auto]",
+    "uncertainty_study_streams": f"experiment=method_comparison data=streams {WITHOUT_SLOW} experiment.seeds=1 "
+    "experiment.disjoint=[auto]",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
-    "field_study": "experiment=field_study",
     "validate_study": "experiment=validate_study data=shared_scenes",
     "validate_study_streams": "experiment=validate_study data=streams experiment.rooms=[]",
     "validate_study_unseen": "experiment=validate_study data=synthetic_seeds "
@@ -73,10 +73,6 @@ EXPERIMENTS = {
     "align_study_unseen_3": "experiment=align_study data=synthetic_seeds "
     "data.seed=[45,46,47,48,49,50,51,52,53,54,55,56,57,58,59,60,61,62,63,64]",
     "scale_study": "experiment=scale_study data=streams",
-    "shared_scenes": "experiment=opencv_twin data=shared_scenes",
-    "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
-    "room_phone": "experiment=opencv_twin data=synthetic_seeds",
-    "room_rotation": "experiment=opencv_twin data.lidar=exact data.path=rotation",
     "heldout": "experiment=heldout data=shared_scenes method=paper",
     "range_split": "experiment=range_split data=shared_scenes method=paper",
     "gate_ablation": "experiment=gate_ablation data=shared_scenes method=paper",
@@ -173,8 +169,10 @@ NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items()
 
 #: Options that change no number of the archived results, and which a file may hold otherwise: ``verify`` silences only
 #: pairs whose depth belongs to other pixels, the corrections of a capture are unset, and images ``between`` are nothing
-#: to a tracker that has no option of that name.
+#: to a tracker that has no option of that name; a file has the numbers of methods that are gone beside today's, and
+#: lacks those that are computed from the same answers today.
 ASIDE = {
+    *("auto_2", "paper_dlt", "baselines", "exact", "floors"),
     "figures",
     "traceback",
     "root",
@@ -188,7 +186,7 @@ ASIDE = {
 
 #: Options that a file may lack, and the value that leaves the part of the method out.
 LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": None, "complete": None}
-LEFT_OUT |= {"weight": "variance"}
+LEFT_OUT |= {"weight": "variance", "chained": [], "gaps": [], "disjoint": []}
 LEFT_OUT |= dict.fromkeys(("trajectory_lag_s", "trajectory_drift_deg_per_s", "trajectory_rotation_noise_deg"), 0.0)
 
 #: What a result needs beside this machine and an idle hour; speeds need a machine that does nothing else.

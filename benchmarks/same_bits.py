@@ -52,8 +52,6 @@ PACKAGE = "dhtorch"
 #: What a function, class or table is called here → where it may be, the current name first.
 NAMES: dict[str, tuple[str, ...]] = {
     "methods": ("pipeline.presets.METHODS", "methods.METHODS"),
-    "map_1": ("experiments.baselines.frozen.MAP_1", "first_release.MAP_1"),
-    "window_1": ("experiments.baselines.frozen.WINDOW_1", "first_release.WINDOW_1"),
     "track_hint": ("TrackHint", "records.TrackHint"),
     "pose": ("Pose", "records.Pose"),
     "pose_prior": ("PosePrior", "records.PosePrior", "records.GivenPose"),
@@ -146,7 +144,7 @@ SETTINGS = ("conf", "dhtorch/conf")
 
 MODES = ("plain", "compiled")
 
-METHODS = ("paper", "map", "window", "auto", "map_1", "window_1")
+METHODS = ("paper", "map", "window", "auto")
 
 #: Scenes of the quick mode; those on which completion, alignment and validation run, the first of them in quick mode.
 QUICK_SCENES = ("holo_a", "7s_redkitchen_000", "tum_fr1_desk9")
@@ -216,8 +214,8 @@ def composed(path: str) -> Any:
 
 
 def method(name: str) -> Any:
-    """The method of that name, those of the first release included."""
-    return resolve(name) if name in NAMES else resolve("methods")[name]
+    """The method of that name; ``window`` is ``map`` of five source views."""
+    return resolve("methods")["map"].replace(views=5) if name == "window" else resolve("methods")[name]
 
 
 # ------------------------------------------------------------------------------------------------------------- inputs
@@ -413,7 +411,7 @@ def validated(case: Case, others: Any, *, depth: Tensor | None, quick: bool = Fa
 def room_items(case: Case) -> list[Item]:
     """Other ways to call a method: from settings, in a batch, with a pose from elsewhere, with a graph."""
     items: list[Item] = []
-    for name in ("paper", "map", "window", "auto"):
+    for name in ("paper", "map", "auto"):
         others = case.other if name in ("paper", "map") else case.between
         items.append((f"room {name} from settings", partial(from_settings, case, name, others)))
     items += [(f"room {name}, batch of 2", partial(batch_of_two, case, name)) for name in ("paper", "map")]

@@ -3,9 +3,9 @@
     python benchmarks/stream.py --json benchmarks/results/stream.json
 
 ``auto`` is a whole anchor: the choice among the frames around it, five views and their joining; its peer is
-``window``, handed five views. ``fused`` is that joined with a plane sweep; its peer is the second release's ``auto``
-and sweep, without filters of the map. ``push`` is the newest frame answered from past ones at 640×480 with 1,024
-samples; its peer is the same work in OpenCV's stages: the views that the stream asked, each tracked, posed and
+``map`` of five given views (``window``). ``fused`` is that joined with a plane sweep; its peer is the second release's
+``auto`` and sweep, without filters of the map. ``push`` is the newest frame answered from past ones at 640×480 with
+1,024 samples; its peer is the same work in OpenCV's stages: the views that the stream asked, each tracked, posed and
 triangulated. Frames of 7s_redkitchen_stream_200 (640×480, near limit 2 m) where DHTORCH_DATA is set, else of the
 built-in room. All sides take turns in one process.
 """
@@ -24,16 +24,23 @@ from dhtorch import data, extend
 from dhtorch.data.pairs import candidate_frames, spaced_frames
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines import opencv
-from dhtorch.experiments.baselines.frozen import AUTO_2
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
-from dhtorch.pipeline.presets import AUTO, FUSED, WINDOW
+from dhtorch.pipeline.presets import AUTO, FUSED, MAP
 from dhtorch.pipeline.stream import Stream
 from dhtorch.pytree import stack
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
 from dhtorch.synthetic.recording import SyntheticRoom
+
+#: ``auto`` of the second release.
+AUTO_2 = AUTO.replace(
+    verify_views=None,
+    guide=None,
+    pose_samples=0,
+    select_views={"near": 0, "prefer_tracked": False, "reserve": 0},
+)
 
 PEER = partial(
     extend,
@@ -63,7 +70,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
         return seen[k]
 
     offered = stack([view(k) for k in candidate_frames(recording, i)])
-    five = stack([view(k) for k in spaced_frames(i, i + gap, WINDOW.views)])
+    five = stack([view(k) for k in spaced_frames(i, i + gap, 5)])
 
     def auto() -> None:
         with torch.no_grad():
@@ -71,7 +78,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
 
     def window() -> None:
         with torch.no_grad():
-            WINDOW(view(i), five)
+            MAP.replace(views=5)(view(i), five)
 
     def fused() -> None:
         with torch.no_grad():

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dhtorch.pipeline.completion import complete_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
-    from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, WINDOW, extend
+    from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, extend
     from dhtorch.pipeline.stream import Stream
     from dhtorch.pytree import collate
     from dhtorch.records import (
@@ -44,7 +44,6 @@ __all__ = [
     "KORNIA",
     "MAP",
     "PAPER",
-    "WINDOW",
     "Camera",
     "CameraPin",
     "DepthValidation",
@@ -70,7 +69,7 @@ __all__ = [
 ]
 
 #: Public name → module that defines it, if that is not ``records``.
-_HOMES = dict.fromkeys(("AUTO", "FUSED", "KORNIA", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
+_HOMES = dict.fromkeys(("AUTO", "FUSED", "KORNIA", "MAP", "PAPER", "extend"), "pipeline.presets")
 _HOMES |= {
     "CameraPin": "measure",
     "ExtendDepth": "transforms",
@@ -87,6 +86,8 @@ _HOMES |= {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "WINDOW":  # kept for one release; an ImportError says so after ``from dhtorch import`` as well
+        raise ImportError("dhtorch.WINDOW is gone, use dhtorch.MAP.replace(views=5)")
     if name in __all__:
         value = getattr(importlib.import_module(f"dhtorch.{_HOMES.get(name, 'records')}"), name)
     elif not name.startswith("_") and importlib.util.find_spec(f"dhtorch.{name}") is not None:

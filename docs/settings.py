@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from dhtorch.experiments.baselines import frozen, opencv, xfeat
+from dhtorch.experiments.baselines import opencv, xfeat
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import METHODS, PAPER_DIRECT
 from dhtorch.pipeline.spec import MethodSpec
@@ -37,11 +37,7 @@ AT_RUN_TIME = {"hint", "device", "dtype", "seed", "fit", "linear"}
 WRITTEN: dict[str, Method] = {
     **METHODS,
     "paper_direct": PAPER_DIRECT,
-    "map_1": frozen.MAP_1,
-    "window_1": frozen.WINDOW_1,
-    "auto_2": frozen.AUTO_2,
     "opencv": opencv.OPENCV,
-    "paper_dlt": opencv.PAPER_DLT,
     "xfeat": xfeat.XFEAT,
 }
 
@@ -102,7 +98,7 @@ def _scalar(value: Any) -> str:
 
 def _source_comment(name: str) -> list[str]:
     """The comment above a method's name in its module."""
-    for module in (sys.modules["dhtorch.pipeline.presets"], frozen, opencv, xfeat):
+    for module in (sys.modules["dhtorch.pipeline.presets"], opencv, xfeat):
         source = inspect.getsource(module)
         if match := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
             return [line.removeprefix("#: ").replace("``", "`") for line in match[1].splitlines()]

@@ -66,7 +66,7 @@ from dhtorch.pipeline import (
     surface,
     view_selection,
 )
-from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
+from dhtorch.pipeline.presets import MAP, PAPER
 from dhtorch.records import Frame, TrackHint
 from dhtorch.stages import (
     backproject,
@@ -837,7 +837,7 @@ def test_no_method_counts_with_masks():
     frames = [room[i] for i in range(3)]
     with NoMasksAsNumbers():
         SyntheticRoom(n_frames=2, seed=1, hw=(96, 128), depth_hw=(24, 32))[0]
-        for method in (PAPER, MAP, WINDOW.replace(views=2)):
+        for method in (PAPER, MAP, MAP.replace(views=2)):
             method.replace(n=64)(frames[0], frames[1:] if method.views > 1 else frames[1])
     with pytest.raises(AssertionError, match="mul of a mask"), NoMasksAsNumbers():
         (frames[0].depth > 0) * frames[0].depth

@@ -25,7 +25,7 @@ def test_every_result_has_a_command_and_every_command_its_result():
     assert {*reproduce.EXPERIMENTS, *reproduce.SCRIPTS} == RESULTS
 
 
-@pytest.mark.parametrize(("part", "names"), [("results part_ablation", {"part_ablation"}), ("pin", set())])
+@pytest.mark.parametrize(("part", "names"), [("kornia twin", {"kornia_twin"}), ("pin", set())])
 def test_a_table_from_a_file_with_earlier_settings_has_a_note_that_names_it(part, names):
     assert {name for name in names if not reproduce.other_settings(name)} == set()
     blocks = [

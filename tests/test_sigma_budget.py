@@ -32,8 +32,9 @@ def answers(views):
     """Estimates by method name, and the calibrated map of the last."""
     found = {}
     with torch.no_grad():
-        for name in ("paper", "kornia", "map", "window", "auto", "fused"):
-            method = METHODS[name].replace(n=512, **({"complete": {"planes": 48}} if name == "fused" else {}))
+        for name in ("paper", "kornia", "map", "several", "auto", "fused"):
+            method = {**METHODS, "several": METHODS["map"].replace(views=5)}[name]
+            method = method.replace(n=512, **({"complete": {"planes": 48}} if name == "fused" else {}))
             found[name] = method(views[0], views[1] if method.views > 1 else views[1][3])
         found["plain"] = complete_depth(*views, method=method, planes=48)
         found["calibrated"] = complete_depth(*views, method=method, planes=48, calibration=default_calibration())
@@ -44,7 +45,7 @@ def total(budget: SigmaBudget) -> torch.Tensor:
     return sum(budget.values())
 
 
-@pytest.mark.parametrize("name", ["paper", "kornia", "map", "window", "auto", "fused", "plain", "calibrated"])
+@pytest.mark.parametrize("name", ["paper", "kornia", "map", "several", "auto", "fused", "plain", "calibrated"])
 def test_the_terms_sum_to_the_square_of_sigma_and_are_empty_where_unanswered(answers, name):
     answer = answers[name]
     budget, keep = answer.budget, answer.keep
@@ -56,7 +57,7 @@ def test_the_terms_sum_to_the_square_of_sigma_and_are_empty_where_unanswered(ans
     assert torch.equal((budget.track == largest)[keep], (budget.dominating == Cause.TRACK)[keep])
 
 
-@pytest.mark.parametrize("name", ["paper", "kornia", "map", "window", "auto", "fused", "plain", "calibrated"])
+@pytest.mark.parametrize("name", ["paper", "kornia", "map", "several", "auto", "fused", "plain", "calibrated"])
 def test_the_stored_parts_are_the_variance_and_need_no_scaling(answers, name):
     answer = answers[name]
     matched = answer.keep

@@ -26,7 +26,7 @@ from dhtorch.measure import metric_scale
 from dhtorch.metrics import errors, reliability, risk
 from dhtorch.metrics.calibration import fit_calibration
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, WINDOW
+from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom, depth_faults
 from dhtorch.validation.capture_check import check_capture
@@ -52,7 +52,14 @@ def frame(k):
 @cache
 def answer(name):
     """A pair, or a reference with several source views, by each method."""
-    methods = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO, "fused": FUSED}
+    methods = {
+        "paper": PAPER,
+        "kornia": KORNIA,
+        "map": MAP,
+        "window": MAP.replace(views=5),
+        "auto": AUTO,
+        "fused": FUSED,
+    }
     method = methods[name].replace(n=256)
     trace = {}
     views = frame(4) if method.views == 1 else stack([frame(k) for k in (1, 2, 5, 7)])

@@ -425,7 +425,7 @@ COMMANDS: dict[str, Command] = {
 _SHARED_NOTES = {
     "quiet": OptionNote("", "-q: print only results and errors; -v also logs inputs and steps"),
     "data": OptionNote("", "a reader or a built-in scene: auto, synthetic, tum, … (see --help-all)"),
-    "method": OptionNote("", "paper, map, auto, window or fused, see docs/methods.md"),
+    "method": OptionNote("", "paper, map, auto or fused, see docs/methods.md"),
     "pairs": OptionNote("", "source views: auto (selected by the method), gap, time or baseline"),
     "holdout": OptionNote("", "range (returns beyond the cutoff are hidden) or none"),
     "experiment": OptionNote("", "pair, range_split, ablation, method_comparison, … (see --help-all)"),

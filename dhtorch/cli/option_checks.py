@@ -200,6 +200,10 @@ def list_choices(argv: Sequence[str], folder: Path) -> dict[str, list[str]]:
         chosen[key] = [str(getattr(each, "text", each)) for each in value]
         for name in chosen[key]:
             if name not in names:
+                from dhtorch.pipeline.presets import GONE_METHODS, gone_method  # noqa: PLC0415
+
+                if key == "method" and name in GONE_METHODS:
+                    raise ValueError(gone_method(name))
                 actual = f"{key}: found {name!r}{console.suggest_name(name, names)}"
                 raise ValueError(f"{actual}, expected one of {', '.join(names)}")
     return chosen

@@ -18,9 +18,9 @@ import torch
 from dhtorch import pytree
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
-from dhtorch.metrics.calibration import fit_calibration
+from dhtorch.metrics.calibration import fit_calibration, list_calibrations, load_calibration
 from dhtorch.metrics.errors import Points
-from dhtorch.metrics.uncertainty import measure_uncertainty
+from dhtorch.metrics.uncertainty import interval_coverage, measure_uncertainty, range_bias
 
 #: Fewest answers of either method for a scene to have a ratio.
 MIN_COMPARED_ANSWERS = 20
@@ -36,6 +36,12 @@ MIN_COMPARED_ERROR = 1e-6
 
 #: Numbers of :func:`dhtorch.metrics.uncertainty.measure_uncertainty` that a comparison adds to its own.
 _UNCERTAINTY_NUMBERS = ("interval_1", "interval_2", "ause", "worst_bias")
+
+#: Largest bias of a range bin of a scene whose truth is exact. Source: the requirement.
+_MAX_EXACT_BIAS = 0.01
+
+#: Fewest answers of a scene whose coverage counts. Source: derived, 1.5 % of standard error at 95 %.
+_MIN_INTERVAL_ANSWERS = 200
 
 #: Scene → the candidates of every seed.
 SeedPoints = Mapping[str, Sequence[Points]]
@@ -59,6 +65,8 @@ def method_ratios(
     reference: str = "paper",
     rooms: Mapping[str, str] | None = None,
     fallback: Mapping[str, str] | None = None,
+    exact: Sequence[str] = (),
+    floors: Mapping[str, float] | None = None,
     draws: int = 2000,
     seed: int = 0,
 ) -> MethodComparison:
@@ -70,15 +78,15 @@ def method_ratios(
         reference: the method to compare with.
         rooms: scene → room, the unit that is held out of calibration; a scene without an entry is its own room.
         fallback: method → the method that replaces it on scenes where it has no candidates of its own, such as
-            ``{"window": "map"}`` where a scene has too few views.
+            ``{"auto": "map"}`` where a scene has too few views.
+        exact, floors: see :func:`stated_uncertainty`.
         draws, seed: of the bootstrap over scenes.
 
     Returns:
         Comparison. For every other method, geometric means over scenes: ``median_rel_ratio`` (each method on its own
         answers), ``median_rel_ratio_at_equal_coverage`` (both cut by their own score to the smaller number of answers,
-        seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``interval_1``,
-        ``interval_2``, ``ause``, ``worst_bias``: of the method's own sigma, means over scenes
-        (:func:`dhtorch.metrics.uncertainty.measure_uncertainty`). ``coverage_at_5``: mean over scenes (on many it is
+        seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. The numbers of
+        :func:`stated_uncertainty`. ``coverage_at_5``: mean over scenes (on many it is
         zero, so that their median jumps). In held-out rooms, means over scenes: ``within_sigma`` and ``within_2sigma``
         after the correction of sigma; ``realised_risk_<per cent>``, mean capped error at the threshold that nine in ten
         of the other scenes keep, where a scene without an answer above it counts 0 (``risk_of_speaking_<per cent>``:
@@ -99,7 +107,7 @@ def method_ratios(
         rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
         numbers = _ratios(ours, complete[reference], rows, comparison.left_out.setdefault(method, []), draws, seed)
         numbers |= evaluate_promises(ours, rooms, rows, draws, seed)
-        numbers |= _stated_uncertainty(ours, rows, draws, seed)
+        numbers |= stated_uncertainty(method, ours, rows, exact=exact, floors=floors, draws=draws, seed=seed)
         for percent in _TARGET_PERCENT:
             key = f"realised_risk_{percent}"
             comparison.unanswered[f"{method}.{percent}"] = [
@@ -141,17 +149,21 @@ def multiview_ratios(
 
 
 def twin_ratios(ours: SeedPoints, theirs: SeedPoints, name: str) -> dict[str, Interval]:
-    """How two implementations of one method agree: geometric means over scenes of the ratios of coverage and error.
+    """How two methods compare on the same pairs: geometric means over scenes of the ratios of coverage and error.
 
     Returns:
         ``coverage_ratio_to_<name>``, of the answered fractions of the candidates; ``error_ratio_to_<name>``, of the
-        median relative errors of each one's answers. Scenes with too few answers of either have no ratio.
+        median relative errors of each one's answers; ``equal_error_ratio_to_<name>``, of those where both are cut by
+        their own score to the smaller number of answers. Scenes with too few answers of either have no ratio.
     """
-    metrics = {"coverage": lambda p: float(p.keep.double().mean()), "error": _median_rel}
     scenes = [scene for scene in ours if scene in theirs]
     one, other = ({scene: side[scene] for scene in scenes} for side in (ours, theirs))
-    ratios = {key: ratio_over_seeds(one, other, metric)[0] for key, metric in metrics.items()}
-    return {f"{k}_ratio_to_{name}": _geometric_mean(v, draws=2000, seed=0) for k, v in ratios.items()}
+    ratios = {
+        "coverage": ratio_over_seeds(one, other, lambda p: float(p.keep.double().mean())),
+        "error": ratio_over_seeds(one, other, _median_rel),
+        "equal_error": ratio_over_seeds(*cut_to_equal_coverage(one, other), _median_rel),
+    }
+    return {f"{k}_ratio_to_{name}": _geometric_mean(v, draws=2000, seed=0) for k, (v, _) in ratios.items()}
 
 
 def ratio_over_seeds(
@@ -217,18 +229,62 @@ def _ratios(
     }
 
 
-def _stated_uncertainty(
-    ours: SeedPoints, rows: dict[str, dict[str, Any]], draws: int, seed: int
+def stated_uncertainty(
+    method: str,
+    ours: SeedPoints,
+    rows: dict[str, dict[str, Any]],
+    *,
+    exact: Sequence[str] = (),
+    floors: Mapping[str, float] | None = None,
+    draws: int = 2000,
+    seed: int = 0,
 ) -> dict[str, Interval]:
-    """Coverage of the intervals of the method's own sigma, AUSE and bias by range, means over scenes; seeds pooled."""
+    """Whether the method's own sigma holds, seeds pooled: intervals, AUSE and bias by range.
+
+    Args:
+        method: its name; the package's calibration of that name gives the ``calibrated_`` numbers.
+        ours: scene → candidates of every seed.
+        rows: scene → its numbers; filled in place, also with ``bias_bins`` and the ``floor`` of the scene.
+        exact: starts of names of scenes with exact truth: their floor is 1 %.
+        floors: start of a scene's name → printed relative error of its truth; the longest fitting start counts.
+        draws, seed: of the bootstrap over scenes.
+
+    Returns:
+        Means over scenes of ``interval_1``, ``interval_2``, ``ause`` and ``worst_bias``
+        (:func:`dhtorch.metrics.uncertainty.measure_uncertainty`). Over scenes with 200 answers: ``scenes_within``, the
+        fraction of scenes whose ``interval_2`` is .95 ± .03 (``calibrated_scenes_within``: after the calibration);
+        ``room_bias``, the largest bias of a range bin of a scene with exact truth, and ``bias_over_floor``, the largest
+        ratio of one to the floor of any other scene that has one.
+    """
+    start_floors = {**(floors or {}), **dict.fromkeys(exact, _MAX_EXACT_BIAS)}
+    within: dict[str, list[float]] = {"scenes_within": [], "calibrated_scenes_within": []}
+    biases: dict[bool, list[float]] = {True: [], False: []}
     for scene, points in ours.items():
-        numbers = measure_uncertainty(pytree.collate(points))
-        rows[scene] |= {k: numbers[k] for k in _UNCERTAINTY_NUMBERS}
+        pooled = pytree.collate(points)
+        numbers = measure_uncertainty(pooled)
+        fitting = max((start for start in start_floors if scene.startswith(start)), key=len, default=None)
+        floor = None if fitting is None else start_floors[fitting]
+        bins = range_bias(pooled)
+        row: dict[str, Any] = {k: numbers[k] for k in _UNCERTAINTY_NUMBERS}
+        row |= {"floor": floor, "bias_bins": [b._asdict() for b in bins]}
+        if method in list_calibrations():
+            calibrated = load_calibration(method).apply(pooled)
+            row |= {f"calibrated_{k}": interval_coverage(calibrated, k) for k in (1, 2)}
+        rows[scene] |= row
+        if int(pooled.keep.sum()) < _MIN_INTERVAL_ANSWERS:
+            continue
+        for name, key in (("scenes_within", "interval_2"), ("calibrated_scenes_within", "calibrated_2")):
+            within[name] += [float(abs(row[key] - 0.95) <= 0.03)] if row.get(key) is not None else []
+        if floor is not None:
+            biases[fitting in exact] += [abs(b.bias) / (1 if fitting in exact else floor) for b in bins]
+    stated: dict[str, Sequence[float | None]] = {k: [row[k] for row in rows.values()] for k in _UNCERTAINTY_NUMBERS}
     return {
-        name: bootstrap.interval_over_scenes(
-            [row[name] for row in rows.values()], statistic="mean", draws=draws, seed=seed
-        )
-        for name in _UNCERTAINTY_NUMBERS
+        **{
+            name: bootstrap.interval_over_scenes(values, statistic="mean", draws=draws, seed=seed)
+            for name, values in (stated | within).items()
+        },
+        "room_bias": Interval(max(biases[True], default=None), None, None, len(biases[True])),
+        "bias_over_floor": Interval(max(biases[False], default=None), None, None, len(biases[False])),
     }
 
 

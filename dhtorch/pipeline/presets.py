@@ -70,9 +70,6 @@ MAP = PAPER.replace(
     score=confidence_from_error,
 )
 
-#: ``MAP`` for several source views of one reference view: each view a pair, consistent inverse depths are fused.
-WINDOW = MAP.replace(views=5)
-
 #: Source views are selected among those around the reference view; tracks start at the coarse flow of the whole image,
 #: whatever the exposures; with a pose prior, what no track answers is searched for. An answer needs consistent views or
 #: one with a small sigma, near returns that far points do not contradict, and poses without a large error that all
@@ -96,7 +93,22 @@ AUTO = MAP.replace(
 FUSED = AUTO.replace(complete=fuse_with_sweep)
 
 #: Methods by name.
-METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO, "fused": FUSED}
+METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "auto": AUTO, "fused": FUSED}
+
+#: Name of a method that is gone → what replaces it, in Python and on the command line. Kept for one release.
+GONE_METHODS = {
+    "window": "MAP.replace(views=5), or method=map method.views=5",
+    "map_1": "MAP.replace(verify=None), or method=map method.verify=null",
+    "window_1": "MAP.replace(verify=None, views=5), or method=map method.verify=null method.views=5",
+    "auto_2": "AUTO.replace(verify_views=None, guide=None, pose_samples=0, select_views={'near': 0, 'reserve': 0, "
+    "'prefer_tracked': False})",
+    "paper_dlt": "PAPER.replace(triangulate={'solver': opencv_triangulate}) of dhtorch.experiments.baselines.opencv",
+}
+
+
+def gone_method(name: str) -> str:
+    """Sentence for the name of a method in :data:`GONE_METHODS`."""
+    return f"method {name} is gone (CHANGELOG.md; commit affa1d37 has it), use {GONE_METHODS[name]}"
 
 
 def with_sensor(method: Method, sensor: str | Sequence[float] | None) -> Method:
@@ -116,6 +128,8 @@ def get_method(method: str | Method, n: int | None = None) -> Method:
     Raises:
         ValueError: an unknown name, or another type.
     """
+    if isinstance(method, str) and method in GONE_METHODS:
+        raise ValueError(gone_method(method))
     if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
         raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
     resolved = METHODS[method] if isinstance(method, str) else method

@@ -139,8 +139,8 @@ def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):
     ("typed", "methods"),
     [
         ("method=choice(paper,map)", ["paper", "map"]),
-        ("method=glob(map*)", ["map", "map_1"]),
-        ("method=glob([map*,opencv],exclude=map_1)", ["map", "opencv"]),
+        ("method=glob(pa*)", ["paper", "paper_direct"]),
+        ("method=glob([pa*,opencv],exclude=paper_direct)", ["paper", "opencv"]),
     ],
 )
 def test_the_sweeps_of_hydra_choose_groups(command, monkeypatch, typed, methods):

@@ -9,7 +9,7 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments.baselines import filling, stereo
-from dhtorch.experiments.compare import dense_comparison, exact_rooms
+from dhtorch.experiments.compare import dense_comparison
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import se3
 from dhtorch.metrics import errors
@@ -53,7 +53,7 @@ def pair(room):
     return (
         range_split(reference, NEAR),
         other,
-        exact_rooms.exact_pose_fit(reference, other, 1).T_1_from_0,
+        dense_comparison.exact_pose_fit(reference, other, 1).T_1_from_0,
         grid,
         reference,
     )
@@ -125,7 +125,7 @@ def test_bars_are_held_one_by_one():
 @pytest.mark.parametrize("tipped", [False, True])
 def test_rectified_matching_is_right_whichever_way_the_other_camera_lies(room, mirrored, tipped):
     reference, other = (room[k] for k in ((11, 3) if mirrored else (3, 11)))
-    T = exact_rooms.exact_pose_fit(reference, other, 1).T_1_from_0
+    T = dense_comparison.exact_pose_fit(reference, other, 1).T_1_from_0
     if tipped:  # both cameras rolled by a right angle: the other view is above or below
         reference, other = (rolled(frame) for frame in (reference, other))
         roll = se3.exp(torch.tensor([[0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.0]]))
@@ -193,12 +193,12 @@ def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
 def test_rooms_are_judged_where_both_views_see_texture(room):
     reference, other = room[3], room[11]
     odd = torch.zeros(1, 120, 160, dtype=torch.bool)
-    asked = exact_rooms.evaluated_pixels(reference, other, odd)
+    asked = dense_comparison.evaluated_pixels(reference, other, odd)
     assert 500 < asked.sum() < 0.9 * asked.numel() and bool((reference.depth[asked] > NEAR).all())
     odd[:, :, 80:] = True
-    assert not bool(exact_rooms.evaluated_pixels(reference, other, odd)[:, :, 76:].any())
+    assert not bool(dense_comparison.evaluated_pixels(reference, other, odd)[:, :, 76:].any())
     away = other.replace(depth=0.5 * other.depth)
-    assert not bool(exact_rooms.evaluated_pixels(reference, away, odd).any()), "another surface stands before it"
+    assert not bool(dense_comparison.evaluated_pixels(reference, away, odd).any()), "another surface stands before it"
 
 
 @pytest.mark.parametrize("option", [{"stride": 0}, {"reference_views": 0}, {"stride": 1.5}])

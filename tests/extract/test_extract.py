@@ -254,7 +254,7 @@ def test_a_corrupt_frame_is_skipped_or_flagged_with_zeros_and_counted(on_error, 
         (["out=x", "data.n_frames=3", "extract.gap=-1"], ["extract.gap: found -1, expected a whole number of at least 0"]),
         (["out=file", "data.n_frames=3"], ["file", "expected a folder"]),
         (["out=file/below", "data.n_frames=3"], ["file"]),
-        (["out=x", "method=window", "extract.gap=3"], ["views", "5"]),
+        (["out=x", "method=map", "method.views=5", "extract.gap=3"], ["views", "5"]),
         (["--outt", "x"], ["--outt", "unknown option"]),
     ],
 )  # fmt: skip

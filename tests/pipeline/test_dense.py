@@ -6,7 +6,7 @@ from support.board_scenes import Board, look
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, Source, is_swept
-from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
+from dhtorch.experiments.compare.dense_comparison import exact_pose_fit
 from dhtorch.metrics.calibration import Calibration, SigmaModel
 from dhtorch.metrics.holdout import range_split
 from dhtorch.metrics.monotone import MonotoneTable, Sigmoid

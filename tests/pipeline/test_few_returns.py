@@ -11,6 +11,11 @@ from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
 
+#: ``AUTO`` without added samples and what came with them.
+AUTO_2 = AUTO.replace(
+    verify_views=None, guide=None, pose_samples=0, select_views={"near": 0, "prefer_tracked": False, "reserve": 0}
+)
+
 #: The first candidates see what the reference view sees, the last do not.
 CANDIDATES = (1, 3, 4, 5, 6, 8, 10, 12)
 

@@ -10,7 +10,9 @@ import torch
 from support.rooms import room as rendered
 
 import dhtorch
-from dhtorch import AUTO, KORNIA, MAP, PAPER, WINDOW, TrackHint, pytree
+from dhtorch import AUTO, KORNIA, MAP, PAPER, TrackHint, pytree
+from dhtorch.cli.option_checks import list_choices
+from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import pair as pairs
@@ -20,6 +22,7 @@ from dhtorch.extract import plan
 from dhtorch.extract.dataset import RowDataset
 from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import GONE_METHODS, get_method
 from dhtorch.pipeline.spec import iter_networks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
@@ -146,10 +149,13 @@ def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
 
 
 def test_a_method_is_a_frozen_record_that_travels():
-    assert isinstance(PAPER, Method) and dhtorch.extend is PAPER and WINDOW.views == 5 and MAP.views == 1
+    assert isinstance(PAPER, Method) and dhtorch.extend is PAPER and MAP.views == 1
     with pytest.raises(AttributeError):
         PAPER.n = 3
-    assert all(getattr(WINDOW, f.name) is getattr(MAP, f.name) for f in fields(Method) if f.name != "views")
+    several = MAP.replace(views=5)
+    assert all(getattr(several, f.name) is getattr(MAP, f.name) for f in fields(Method) if f.name != "views")
+    with pytest.raises(ImportError, match=r"use dhtorch\.MAP\.replace\(views=5\)"):
+        dhtorch.WINDOW  # noqa: B018
     again = pickle.loads(pickle.dumps(MAP))
     assert again.track.keywords == MAP.track.keywords and again.pose is MAP.pose
 
@@ -212,10 +218,17 @@ def test_several_views_must_be_some(room):
         PAPER(room[0], [])
 
 
+@pytest.mark.parametrize("name", GONE_METHODS)
+def test_a_method_that_is_gone_is_named_with_its_replacement(name):
+    for call in (partial(get_method, name), partial(list_choices, [f"method={name}"], config_dir())):
+        with pytest.raises(ValueError, match=rf"method {name} is gone .*, use (MAP|AUTO|PAPER)\.replace"):
+            call()
+
+
 def test_a_method_states_a_sigma_with_a_score_made_of_it_or_with_fitted_noise():
     """The paper's score orders answers; OpenCV's and kornia's stages change nothing about that."""
     silent = (PAPER, KORNIA, OPENCV, PAPER.replace(n=512, score={"half_parallax_deg": 1.0}))
     assert not any(each.states_sigma for each in silent)
     parts = (PAPER.replace(score=MAP.score), MAP.replace(score=PAPER.score), PAPER.replace(score=lambda e, *_: e))
-    assert all(each.states_sigma for each in (MAP, WINDOW, AUTO, *parts))
+    assert all(each.states_sigma for each in (MAP, AUTO, *parts))
     assert not MAP.replace(score=PAPER.score, triangulate={"fitted_noise": False}).states_sigma

@@ -6,7 +6,7 @@ from support.board_scenes import Board, look
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, PoseCode, Source
-from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
+from dhtorch.experiments.compare.dense_comparison import exact_pose_fit
 from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.metrics.holdout import range_split

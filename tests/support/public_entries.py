@@ -66,7 +66,6 @@ def public_results(layout: str | None = None) -> dict[str, list[Tensor]]:
     results = {
         "PAPER": dhtorch.PAPER(a, c, **few, hint=dhtorch.TrackHint(between=[b.image])),
         "MAP": dhtorch.MAP(a, [c], **few),
-        "WINDOW": dhtorch.WINDOW(a, [b, c], **few),
         "AUTO": dhtorch.AUTO(a, (c,), **few),
         "complete_depth": maps,
         "validate_depth": dhtorch.validate_depth(view(first.depth), a, c, size=32),

@@ -158,7 +158,7 @@ def test_without_a_sweep_there_are_no_swept_pixels():
 
 def test_a_method_that_chooses_sweeps_what_it_chose():
     room = room_scene(rendered(hw=(180, 240), n_frames=6))
-    method = METHODS["window"].replace(n=256, views=2)
+    method = METHODS["map"].replace(n=256, views=2)
     found = make_exhibit(
         room, method, lambda r: by_choice(r, stride=9), Settings(cutoff=CUTOFF), sweep=DenseSweep({"planes": 16})
     )

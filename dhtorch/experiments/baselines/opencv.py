@@ -182,7 +182,3 @@ def _as_numpy(x: Tensor, dtype: type) -> np.ndarray:
 
 #: ``PAPER`` with OpenCV's stages: LK forward and backward, EPnP-RANSAC with LM refinement, triangulatePoints.
 OPENCV = PAPER.replace(track=opencv_lucas_kanade, pose=opencv_pnp_ransac, triangulate={"solver": opencv_triangulate})
-
-#: ``PAPER`` with OpenCV's linear triangulation: the residual is distributed over both views instead of the second
-#: alone.
-PAPER_DLT = PAPER.replace(triangulate={"solver": opencv_triangulate})

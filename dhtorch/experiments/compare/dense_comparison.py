@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Gate, is_estimated
@@ -25,19 +26,22 @@ from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import filling, stereo
-from dhtorch.experiments.compare.exact_rooms import measure_rooms
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.outcome import join_outcomes
 from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
+from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap, errors, holdout, map_quality, risk
 from dhtorch.metrics.errors import Points
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
-from dhtorch.records import DepthMap, Estimate, Frame, Pose, Samples
+from dhtorch.records import DepthMap, Estimate, Frame, Pose, PoseFit, Samples
+from dhtorch.synthetic import SyntheticRoom
 
 QUESTION = "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?"
 EXPECTATION = (
@@ -210,7 +214,9 @@ def run(
     Raises:
         ValueError: an option out of range; else as the main job.
     """
-    _check_options(stride=stride, **({} if reference_views is None else {"reference_views": reference_views}))
+    for name, value in {"stride": stride, "reference_views": 1 if reference_views is None else reference_views}.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 1")
     sparse = method or next(iter(chosen.values()))
     options = dict(sweep or {})
     all_scenes = list(scenes_of(scenes))
@@ -455,7 +461,82 @@ def _interval_over(values: Sequence[float | None], statistic: str) -> Row:
     return bootstrap.interval_over_scenes(values, statistic=statistic).entry("1")
 
 
-def _check_options(**options: int) -> None:
-    for name, value in options.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 1")
+# ------------------------------------------------------------------- built-in rooms with exact depth and poses
+
+#: Near limit of a room, m, and the frames of its reference view and source view.
+_NEAR_LIMIT_M, _VIEW_FRAMES = 2.0, (3, 11)
+
+
+def measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
+    """Fraction of pixels within 1 %, mean over rooms: ``dense.room_within_1`` of answered pixels, ``…_of_all`` of all.
+
+    Unanswered pixels count as misses in ``dense.room_within_1_of_all``. ``dense.room_step_wrong_share``: wrong answers
+    over answers beside a depth step (:func:`dhtorch.metrics.map_quality.step_counts`). Pixels are those of
+    :func:`evaluated_pixels`.
+    """
+    of_answered, of_all, at_steps = [], [], []
+    for seed in seeds:
+        room = SyntheticRoom(
+            n_frames=max(_VIEW_FRAMES) + 1,
+            hw=(480, 640),
+            depth_hw=(480, 640),
+            lidar="exact",
+            image_noise=0.0,
+            seed=seed,
+        )
+        reference, other = (room[k] for k in _VIEW_FRAMES)
+        near_views = (holdout.range_split(view, _NEAR_LIMIT_M) for view in (reference, other))
+        fit = exact_pose_fit(reference, other, method.n)
+        with torch.no_grad():
+            sparse = method.replace(views=1, select_views=None)
+            depth_map = complete_depth(*near_views, method=sparse, fit=fit, **options)
+        surface = room.truth(_VIEW_FRAMES[0])["surface"]
+        codes = [code for code, name in room.surfaces.items() if name in room.odd_surfaces]
+        odd = torch.isin(surface, torch.tensor(codes, dtype=surface.dtype))
+        evaluated = evaluated_pixels(reference, other, odd)
+        answered = evaluated & is_estimated(depth_map.source)
+        right = int((answered & ((depth_map.depth - reference.depth).abs() < 0.01 * reference.depth)).sum())
+        wrong, beside = map_quality.step_counts(depth_map, reference.depth, ~odd)
+        of_answered.append(right / max(int(answered.sum()), 1))
+        of_all.append(right / max(int(evaluated.sum()), 1))
+        at_steps.append(wrong / max(beside, 1))
+    return {
+        "dense.room_step_wrong_share": _interval_over(at_steps, "mean"),
+        "dense.room_within_1": _interval_over(of_answered, "mean"),
+        "dense.room_within_1_of_all": _interval_over(of_all, "mean"),
+    }
+
+
+def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:
+    """Relative pose from the frames' ``T_world_from_cam`` as a fit with standard deviations of 0.1 mm and 0.1 mrad."""
+    a, b = reference.T_world_from_cam, other.T_world_from_cam
+    assert a is not None and b is not None
+    fit = known_pose_fit(se3.compose(se3.invert(b), a).map(lambda x: x.to(reference.camera.f)), n)
+    one = torch.ones_like(fit.rms_px)
+    cov = 1e-8 * torch.eye(6).to(fit.cov).expand(len(one), 6, 6)
+    return fit.replace(
+        cov=cov, inlier=~fit.inlier, n_inlier=fit.n_inlier + n, rms_px=one, sigma_px=0.1 * one, t_snr=1e3 * one
+    )
+
+
+def evaluated_pixels(reference: Frame, other: Frame, odd: Tensor) -> Tensor:
+    """Mask (B, h, w) of pixels beyond the near limit with texture, on the same surface in the source view (depth within
+    3 %), away from depth steps of 5 % within 11 x 11 pixels, and not near odd surfaces.
+
+    Args:
+        reference, other: frames with exact depth of their image's size.
+        odd: (B, h, w) bool, surfaces whose image is not their own (mirrors, windows).
+    """
+    depth, grey = reference.depth, grayscale(reference.image)
+    mean = F.avg_pool2d(grey, 9, 1, 4)
+    contrast = (F.avg_pool2d(grey.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()[:, 0]
+    low, high = (sign * F.max_pool2d(sign * depth, 11, 1, 5) for sign in (-1, 1))
+    xyz = se3.apply(
+        exact_pose_fit(reference, other, 1).T_1_from_0,
+        cam.unproject(reference.camera, dense.map_pixel_centres(reference, reference.hw)[None], depth.flatten(1)),
+    )
+    depth_1, inside = sample_nearest(other.depth, cam.project(other.camera, xyz))
+    visible = inside & ((depth_1 - xyz[..., 2]).abs() < 0.03 * xyz[..., 2])
+    near_odd = F.max_pool2d(odd.to(depth), 9, 1, 4) > 0
+    textured_far = (depth > _NEAR_LIMIT_M) & (contrast > 0.02)
+    return textured_far & (high < 1.05 * low) & visible.unflatten(1, reference.hw) & ~near_odd

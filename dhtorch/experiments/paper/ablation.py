@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.outcome import join_outcomes
 from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.shared_tracks import stage_key
 from dhtorch.metrics import bootstrap
 from dhtorch.stages.sample import regular_grid, vogel_spiral
 
@@ -32,13 +33,14 @@ def run(
     n: Sequence[int] = (512, 1024, 4096),
     windows: Sequence[int] = (15, 31),
     others: Mapping[str, Method] | None = None,
+    wholes: Mapping[str, Method] | None = None,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Error ratios of single changes on the range split: sampler, number of samples, tracker, method, cutoff.
 
     Variants: the method under its own name, ``sampler grid``, ``sampler vogel``, ``n 512`` …, ``window 15`` …, each of
-    ``others``, and ``cutoff x0.5``. The summary adds ``<variant>.median_rel_ratio``, the geometric mean over scenes of
-    its error to the method's.
+    ``others`` and ``wholes``, and ``cutoff x0.5``. The summary adds ``<variant>.median_rel_ratio``, the geometric
+    mean over scenes of its error to the method's.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
@@ -46,6 +48,9 @@ def run(
         n: numbers of samples.
         windows: sides of the tracking window, px.
         others: name → further methods to run unchanged.
+        wholes: name → further methods that are run unchanged and taken apart as well: ``+ <stage> of <name>`` is the
+            ablated method with one stage or option of the whole, ``- <stage> of <name>`` the whole with that of the
+            ablated method. They enter no verdict.
     """
     name, method = next(iter(methods.items()))
     changed: dict[str, Method] = {
@@ -56,6 +61,14 @@ def run(
         **{f"window {side}": method.replace(track={"window": side}) for side in windows},
         **{other: m for other, m in (others or {}).items() if other != name},
     }
+    judged = list(changed)
+    for other, whole in (wholes or {}).items():
+        changed[other] = whole
+        for stage in (f.name for f in fields(Method)):
+            ours, theirs = getattr(method, stage), getattr(whole, stage)
+            if stage_key(ours) != stage_key(theirs):
+                changed[f"+ {stage} of {other}"] = method.replace(**{stage: theirs})
+                changed[f"- {stage} of {other}"] = whole.replace(**{stage: ours})
     variants = {k: Variant(m) for k, m in changed.items()}
     main = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     half_cutoff = protocol.run(
@@ -70,12 +83,12 @@ def run(
     ratios = {k: _error_ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
         outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.without_interval(value, count)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict({k: v for k, (v, _) in ratios.items()}))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict({k: ratios[k][0] for k in judged[1:]}))
 
 
 def verdict(ratios: Mapping[str, float | None]) -> tuple[bool | None, str]:
     """(no change lowers the error ratio below 0.9; the ratios)."""
-    measured = {k: v for k, v in ratios.items() if v is not None and not k.startswith("cutoff")}
+    measured = {k: v for k, v in ratios.items() if v is not None}
     if not measured:
         return None, "no scene with answers"
     best = min(measured, key=lambda k: measured[k])

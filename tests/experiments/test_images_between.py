@@ -1,18 +1,17 @@
-"""Images between the two of a pair: which frames reach the tracker, and the study of what they are good for."""
+"""Images between the two of a pair: which frames reach the tracker."""
 
 from functools import partial
 
 import pytest
 import torch
-from support.numbered_frames import MAP, NEAR, frame, scene, track
+from support.numbered_frames import MAP, frame, scene, track
 from support.rooms import room
 
-from dhtorch.data.pairs import Pair, by_choice, by_gap
+from dhtorch.data.pairs import Pair, by_choice
 from dhtorch.data.rig import join_cameras
 from dhtorch.experiments import protocol
-from dhtorch.experiments.compare import chain_study
 from dhtorch.experiments.loading import images_between
-from dhtorch.experiments.protocol import Outcome, Protocol, Settings, Variant
+from dhtorch.experiments.protocol import Protocol, Settings, Variant
 from dhtorch.experiments.shared_tracks import SharedTracks
 from dhtorch.pipeline.presets import PAPER, PAPER_DIRECT
 from dhtorch.records import TrackHint
@@ -98,47 +97,3 @@ def test_the_paper_method_goes_through_them_and_its_direct_form_does_not():
     plain, pair = (method(recording[0], recording[4], n=256) for method in (PAPER_DIRECT, PAPER))
     same = lambda a, b: torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num())  # noqa: E731
     assert same(direct, plain) and same(pair, plain) and not same(chain, plain)
-
-
-# --- the study -------------------------------------------------------------------------------------------------------
-
-
-def study(scenes, **options):
-    methods = {"paper": MAP, "paper_direct": MAP, "kornia": MAP}
-    ratios = {"paper": "paper_direct", "kornia": "paper", "paper_chain": "paper"}
-    return chain_study.run(
-        scenes, methods, by_gap, Settings(cutoff=NEAR + 1), **{"chained": ["paper"], "ratios": ratios} | options
-    )
-
-
-def test_ratios_are_those_of_the_methods_on_scenes_with_frames_between():
-    outcome = study([scene(), scene("pair", n=2), scene("carousel", role="rotation")])
-    assert set(outcome.scenes("paper")) == {"hall"}
-    values = {name: entry["value"] for name, entry in outcome.summary.items() if "_ratio_to_" in name}
-    assert values["paper.coverage_ratio_to_paper_direct"] == values["paper.error_ratio_to_paper_direct"] == 1
-    assert values["kornia.equal_error_ratio_to_paper"] == 1 and len(values) == 9
-    assert values["paper_chain.coverage_ratio_to_paper"] == 1, "its hops end where its registration does"
-    assert outcome.verdict == "refuted" and outcome.why.startswith("3 of 4 bars met; paper.coverage_ratio")
-
-
-def test_every_bar_counts(monkeypatch):
-    def answered(**values):
-        ratios = {
-            name: {"value": 1.6 if "direct" in name and "coverage" in name else 1.0} for name in chain_study.CHAIN_BARS
-        }
-        outcome = Outcome(summary=ratios | {name: {"value": value} for name, value in values.items()})
-        monkeypatch.setattr(chain_study.pair, "run", lambda *_, **__: outcome)
-        return chain_study.run([], {"paper": MAP}, by_gap, Settings(), chained=(), ratios={})
-
-    assert answered().verdict == "supported"
-    assert answered(**{"kornia.coverage_ratio_to_paper": None}).verdict == "undecided"
-    for name, (low, high) in chain_study.CHAIN_BARS.items():
-        for value in (low - 0.01, *([high + 0.01] if high < 9 else [])):
-            assert answered(**{name: value}).verdict == "refuted"
-
-
-def test_methods_that_are_not_there():
-    with pytest.raises(ValueError, match=r"experiment.chained: found map, expected some of"):
-        study([scene()], chained=["map"])
-    with pytest.raises(ValueError, match=r"experiment.methods: found .*expected xfeat as well"):
-        study([scene()], ratios={"xfeat": "paper"})
