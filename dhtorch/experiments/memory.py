@@ -55,12 +55,15 @@ def _child_peak(call: Callable[[], Any], before: Callable[[], Any] | None, threa
         before()
     call = _call_on_copies(call)
     gc.collect()
-    _trim_heap()
-    _reset_peak()
-    start = _resident_bytes()
+    with contextlib.suppress(OSError, AttributeError):  # free memory that the process reuses is not counted
+        ctypes.CDLL(None).malloc_trim(0)
+    with contextlib.suppress(OSError):  # the high-water mark becomes the resident bytes, where the kernel allows it
+        Path("/proc/self/clear_refs").write_text("5")
+    start = _read_proc_status("VmRSS") or _rusage()
     with torch.no_grad():
         call()
-    highest = _peak_bytes()
+    # the kernel's high-water mark of this address space first: ru_maxrss of a new process starts at its parent's size
+    highest = _read_proc_status("VmHWM") or _rusage()
     return None if start is None or highest is None else max(highest - start, 0) / _MIB
 
 
@@ -70,32 +73,6 @@ def _call_on_copies(call: Any) -> Any:
         copies = [a.map(torch.clone) if isinstance(a, Record) else _call_on_copies(a) for a in call.args]
         return partial(call.func, *copies, **call.keywords)
     return call.clone() if isinstance(call, torch.Tensor) else call
-
-
-def _resident_bytes() -> int | None:
-    """Resident bytes now."""
-    return _read_proc_status("VmRSS") or _rusage()
-
-
-def _peak_bytes() -> int | None:
-    """Peak of the resident bytes so far.
-
-    The kernel's high-water mark of this address space comes first: ``ru_maxrss`` of a new process starts at the size of
-    its parent.
-    """
-    return _read_proc_status("VmHWM") or _rusage()
-
-
-def _trim_heap() -> None:
-    """Return free memory to the system where the C library can, as memory that it reuses is not counted."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def _reset_peak() -> None:
-    """Reset the high-water mark to the resident bytes, where the kernel allows it."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _read_proc_status(name: str) -> int | None:

@@ -352,7 +352,24 @@ class _SceneCollector:
             view_key, frames = self._source_views(variant, batch, views, candidates)
             if view_key not in inputs:  # one record for all variants with equal input, so that they share tracks
                 inputs[view_key] = pytree.stack(frames) if len(frames) > 1 else next(iter(frames), None)
-            estimate, trace = self._run_variant(variant, batch, reference, inputs[view_key], shared)
+            others = inputs[view_key]
+            method = variant.method if batch.others and variant.offers is None else with_view_selection(variant.method)
+            trace: Trace = {}
+            # some synthetic recordings distort tracks
+            distort = getattr(self.scene.recording, "spoil_track", lambda track: track)
+            seed = self.settings.seed if variant.seed is None else variant.seed
+            track = distort(shared.shared_tracker(method.track))
+            hint = self.scene.hint if variant.offers is not None else self._hint(batch, others)
+            options: dict[str, Any] = {"seed": seed, "hint": hint, "track": track}
+            if variant.fit is not None:
+                options["fit"] = variant.fit(batch, method.n)
+            options |= variant.call_options(batch)
+            if others is None:  # no source view: all samples count, none is tracked
+                options["track"] = _track_nothing
+            with torch.no_grad():
+                call = method if variant.estimate is None else partial(variant.estimate, method)
+                estimate = call(reference, reference if others is None else others, trace=trace, **options)
+            shared.charge(trace["ms"])
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
@@ -430,28 +447,6 @@ class _SceneCollector:
             return variant.method.views, list(views[-variant.method.views :])
         positions = tuple(candidate_views(batch.pairs[0], self.scene.recording, variant.offers))
         return positions, [offered[k] for k in positions]
-
-    def _run_variant(
-        self, variant: Variant, batch: Batch, reference: Frame, others: Frame | None, shared: SharedTracks
-    ) -> tuple[Estimate, Trace]:
-        method = variant.method if batch.others and variant.offers is None else with_view_selection(variant.method)
-        trace: Trace = {}
-        # some synthetic recordings distort tracks
-        distort = getattr(self.scene.recording, "spoil_track", lambda track: track)
-        seed = self.settings.seed if variant.seed is None else variant.seed
-        track = distort(shared.shared_tracker(method.track))
-        hint = self.scene.hint if variant.offers is not None else self._hint(batch, others)
-        options: dict[str, Any] = {"seed": seed, "hint": hint, "track": track}
-        if variant.fit is not None:
-            options["fit"] = variant.fit(batch, method.n)
-        options |= variant.call_options(batch)
-        if others is None:  # no source view: all samples count, none is tracked
-            options["track"] = _track_nothing
-        with torch.no_grad():
-            call = method if variant.estimate is None else partial(variant.estimate, method)
-            estimate = call(reference, reference if others is None else others, trace=trace, **options)
-        shared.charge(trace["ms"])
-        return estimate, trace
 
     def _hint(self, batch: Batch, others: Frame | None) -> TrackHint:
         """The scene's hint, with the images between the reference view and its only source view."""

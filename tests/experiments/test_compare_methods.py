@@ -1,7 +1,6 @@
 """One method against another, over seeds, scenes and rooms: by plain loops."""
 
 import functools
-import itertools
 import math
 import statistics
 
@@ -74,19 +73,6 @@ def test_ratios_equal_plain_loops():
     assert [(row["method"], row["scene"]) for row in found.rows] == [("map", s) for s in "abc"]
 
 
-def test_intervals_are_those_of_2000_draws_unless_asked_otherwise():
-    paper, ours = small(1.0, names="abcde", seeds=1), small(0.6, names="abcde", seeds=1, silent=0.5)
-    found = compare.method_ratios({"paper": paper, "map": ours})
-    assert found == compare.method_ratios({"paper": paper, "map": ours}, draws=2000, seed=0)
-    assert found != compare.method_ratios({"paper": paper, "map": ours}, draws=2000, seed=1)
-
-
-def test_seeds_are_paired_and_a_lone_one_raises():
-    one, two = small(1.0, names="a", seeds=1), small(1.0, names="a", seeds=2)
-    with pytest.raises(ValueError, match="shorter"):
-        compare.cut_to_equal_coverage(two, one)
-
-
 def test_promises_equal_plain_loops():
     """Every scene with a calibration learnt from the other rooms alone, its seeds joined."""
     ours, room = small(1.0, names="abcd"), {"a": "hall", "b": "hall"}
@@ -134,25 +120,40 @@ def exact(n, error=0.0):
     return errors.make_points(torch.full((n,), 1 + error), torch.ones(n))
 
 
-def test_a_scene_counts_from_the_twentieth_answer_of_the_median_seed():
-    def ratio(ours, theirs, **options):
-        return compare.ratio_over_seeds(
-            {"a": ours}, {"a": theirs}, lambda p: errors.measure_errors(p)["median_rel"], **options
-        )
-
-    enough, few = [exact(20, 0.5), exact(20, 0.5), exact(3, 0.5)], [exact(19, 0.25), exact(19, 0.25), exact(90, 0.25)]
-    assert ratio(enough, enough) == ({"a": 1.0}, [])
-    assert ratio(enough, few) == ratio(few, enough) == ({}, ["a"])
-    found, left_out = ratio(enough, few, min_answers=19)
-    assert found["a"] == pytest.approx(2) and left_out == []
+def median_rel(points):
+    return errors.measure_errors(points)["median_rel"]
 
 
-def test_errors_below_a_millionth_count_as_one():
-    measure = lambda p: errors.measure_errors(p)["median_rel"]  # noqa: E731
-    ours, theirs = {"a": [exact(30)]}, {"a": [exact(30, 0.5)]}
-    assert compare.ratio_over_seeds(ours, theirs, measure)[0]["a"] == pytest.approx(2e-6)
-    assert compare.ratio_over_seeds(theirs, ours, measure)[0]["a"] == pytest.approx(5e5)
-    assert compare.ratio_over_seeds(ours, ours, measure)[0]["a"] == 1
+def defined_above(points):
+    return None if float(points.depth[0]) < 1.4 else median_rel(points)
+
+
+ENOUGH, FEW = [exact(20, 0.5), exact(20, 0.5), exact(3, 0.5)], [exact(19, 0.25), exact(19, 0.25), exact(90, 0.25)]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "measure", "options", "ratio"),
+    [
+        (ENOUGH, ENOUGH, median_rel, {}, 1),  # the twentieth answer of the median seed counts
+        (ENOUGH, FEW, median_rel, {}, None),
+        (FEW, ENOUGH, median_rel, {}, None),
+        (ENOUGH, FEW, median_rel, {"min_answers": 19}, 2),
+        ([exact(30)], [exact(30, 0.5)], median_rel, {}, 2e-6),  # errors below a millionth count as one
+        ([exact(30, 0.5)], [exact(30)], median_rel, {}, 5e5),
+        ([exact(30)], [exact(30)], median_rel, {}, 1),
+        (
+            [exact(30, 0.5), exact(30, 0.25)],
+            [exact(30, 0.5)] * 2,
+            defined_above,
+            {},
+            1,
+        ),  # seeds without it do not count
+        ([exact(30, 0.5)], [exact(30, 0.5)], lambda _: None, {}, None),
+    ],
+)
+def test_a_ratio_needs_twenty_answers_of_the_median_seed(ours, theirs, measure, options, ratio):
+    found = compare.ratio_over_seeds({"a": ours}, {"a": theirs}, measure, **options)
+    assert found == (({}, ["a"]) if ratio is None else ({"a": pytest.approx(ratio)}, []))
 
 
 def test_a_scene_without_any_error_is_not_silent():
@@ -164,154 +165,82 @@ def test_a_scene_without_any_error_is_not_silent():
     assert back.summary["paper.within_target_5"]["value"] is None, "silence counts neither way"
 
 
-def test_seeds_without_the_number_are_passed_over_and_a_scene_without_any_is_left_out():
-    ours, theirs = {"a": [exact(30, 0.5), exact(30, 0.25)]}, {"a": [exact(30, 0.5)] * 2}
-    some = lambda p: None if float(p.depth[0]) < 1.4 else errors.measure_errors(p)["median_rel"]  # noqa: E731
-    assert compare.ratio_over_seeds(ours, theirs, some)[0] == {"a": 1.0}
-    assert compare.ratio_over_seeds(ours, theirs, lambda _: None) == ({}, ["a"])
-
-
-def test_a_fallback_fills_only_what_a_method_lacks_and_silence_of_a_target_is_named():
+def test_a_fallback_fills_only_what_a_method_lacks():
     paper, ours = small(1.0), small(0.5)
-    window = {"b": small(0.4)["b"]}
-    found = compare.method_ratios({"paper": paper, "map": ours, "window": window}, fallback={"window": "map"}, draws=20)
-    alone = compare.method_ratios({"paper": paper, "window": {**ours, **window}}, draws=20)
-    assert [r for r in found.rows if r["method"] == "window"] == alone.rows
-    assert set(found.unanswered) == {"map.10", "map.5", "window.10", "window.5"}
-    with pytest.raises(ValueError, match=r"compare\.window\.a: found nothing, expected 2 seeds as paper"):
-        compare.method_ratios({"paper": paper, "map": ours, "window": window})
+    several = {"b": small(0.4)["b"]}
+    found = compare.method_ratios({"paper": paper, "map": ours, "auto": several}, fallback={"auto": "map"}, draws=20)
+    alone = compare.method_ratios({"paper": paper, "auto": {**ours, **several}}, draws=20)
+    assert [r for r in found.rows if r["method"] == "auto"] == alone.rows
+    assert set(found.unanswered) == {"map.10", "map.5", "auto.10", "auto.5"}
     assert not compare.method_ratios({"base": paper}, reference="base").summary
-    with pytest.raises(ValueError, match="found no method, expected paper among them"):
-        compare.method_ratios({})
+    assert found != compare.method_ratios({"paper": paper, "map": ours, "auto": several}, fallback={"auto": "map"})
 
 
-# ---------------------------------------------------------------------------------------------------- larger scenes
+PAPER = small(1.0)
 
 
-def seeds_of(scale, names="abcdef", n=150, **options):
-    """Three seeds of every scene; errors are ``scale`` times those of scale 1."""
-    return {
-        name: [scene_of(n, 100 * k + seed, spread=scale, **options) for seed in range(3)]
-        for k, name in enumerate(names)
-    }
+@pytest.mark.parametrize(
+    ("methods", "sentence"),
+    [
+        ({}, "found no method, expected paper among them"),
+        ({"map": PAPER}, r"compare\.reference: found map, expected paper"),
+        ({"paper": PAPER, "map": {"b": PAPER["b"]}}, r"compare\.map\.a: found nothing, expected 2 seeds as paper"),
+        ({"paper": PAPER, "map": PAPER | {"b": PAPER["b"][:1]}}, r"compare\.map\.b: found 1 seeds"),
+        ({"paper": PAPER, "map": PAPER | {"z": PAPER["b"]}}, r"compare\.map\.z: found a scene"),
+    ],
+)
+def test_methods_that_do_not_match_raise(methods, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        compare.method_ratios(methods)
 
 
-def test_ratios_are_medians_over_seeds_then_a_geometric_mean_over_scenes():
-    paper, ours = seeds_of(1.0, n=400), seeds_of(0.5, n=400)
+def test_known_errors_give_known_numbers():
+    """Sigma is right, errors halve, and one room is eight times off what its score and sigma state."""
+    paper = small(1.0, n=400, names="abcdef", seeds=3)
+    ours = small(0.5, n=400, names="abcde", seeds=3) | {"f": small(8.0, n=150, names="f", seeds=3)["f"]}
+    ours["c"] = [scene_of(150, s, silent=1.1) for s in range(3)]
     found = compare.method_ratios({"paper": paper, "map": ours})
-    expected = []
-    for scene in paper:
-        a, b = ([errors.measure_errors(p)["median_rel"] for p in side[scene]] for side in (ours, paper))
-        expected.append(statistics.median(a) / statistics.median(b))
-    entry = found.summary["map.median_rel_ratio"]
-    assert entry["value"] == pytest.approx(statistics.geometric_mean(expected)) == pytest.approx(0.5, abs=0.01)
-    assert entry["low"] <= entry["value"] <= entry["high"] and entry["n"] == 6 and entry["unit"] == "1"
-    assert [row["median_rel_ratio"] for row in found.rows] == pytest.approx(expected)
-    aurc = [
-        statistics.median(risk.measure_risk(p)["aurc"] for p in ours[s])
-        / statistics.median(risk.measure_risk(p)["aurc"] for p in paper[s])
-        for s in paper
-    ]
-    assert found.summary["map.aurc_ratio"]["value"] == pytest.approx(statistics.geometric_mean(aurc))
-    worst = max(row["median_rel_ratio_at_equal_coverage"] for row in found.rows)
-    assert found.summary["map.worst_scene_ratio"]["value"] == worst
-    assert found.left_out == {"map": []}
-
-
-def test_every_number_of_the_comparison_is_there():
-    paper, ours = (seeds_of(scale, names="abcd", n=400) for scale in (1.0, 0.5))
-    methods = {"paper": paper, "map": ours, "window": {"a": seeds_of(0.4, n=400)["a"]}}
-    found = compare.method_ratios(methods, fallback={"window": "map"}, rooms={"b": "kitchen", "c": "kitchen"})
-    names = "median_rel_ratio median_rel_ratio_at_equal_coverage worst_scene_ratio aurc_ratio coverage_at_5"
-    names += " within_sigma within_2sigma ece realised_risk_10 realised_risk_5"
-    for method, name in itertools.product(("map", "window"), names.split()):
-        assert found.summary[f"{method}.{name}"]["value"] is not None, (method, name)
-    assert not any(key.startswith("paper.") for key in found.summary)
-    assert found.summary["map.within_sigma"]["value"] == pytest.approx(0.683, abs=0.03)
-    assert found.summary["map.within_2sigma"]["value"] == pytest.approx(0.954, abs=0.02)
-    assert found.summary["map.ece"]["value"] < 0.06 < found.summary["map.ece_raw"]["value"]
-    assert found.summary["map.realised_risk_10"]["value"] <= 0.1
-    rows = {(row["method"], row["scene"]): row for row in found.rows}
-    assert rows["window", "b"]["median_rel_ratio"] == rows["map", "b"]["median_rel_ratio"]
-    assert rows["window", "a"]["median_rel_ratio"] < rows["map", "a"]["median_rel_ratio"]
-
-
-def test_promises_come_from_other_rooms():
-    strange = {"f": seeds_of(8.0, "f")["f"]}  # errors eight times what sigma and score say
-    ours = seeds_of(1.0, "abcde") | strange
-    found = compare.method_ratios({"paper": seeds_of(1.0), "map": ours})
-    row = next(r for r in found.rows if r["scene"] == "f")
-    assert row["within_sigma"] < 0.2 and row["realised_risk_10"] > 0.2
-    twins = compare.method_ratios({"paper": seeds_of(1.0, "ef"), "map": {"e": ours["e"]} | strange}, rooms={"e": "f"})
-    assert "within_sigma" not in twins.rows[0] and twins.summary["map.ece"]["value"] is None
-
-
-def test_at_equal_coverage_both_are_cut_to_the_smaller():
-    paper, ours = seeds_of(1.0, silent=0.0), seeds_of(1.0, silent=0.6)
-    a, b = compare.cut_to_equal_coverage(ours, paper)
-    for scene, seed in itertools.product(paper, range(3)):
-        assert int(a[scene][seed].keep.sum()) == int(b[scene][seed].keep.sum()) == int(ours[scene][seed].keep.sum())
-    found = compare.method_ratios({"paper": paper, "map": ours})
-    assert found.summary["map.median_rel_ratio_at_equal_coverage"]["value"] > 1.3
-    assert found.summary["map.median_rel_ratio"]["value"] == pytest.approx(1, abs=0.1)
-
-
-def test_scenes_with_few_answers_are_named_and_leave_the_mean():
-    ours = seeds_of(0.5) | {"c": [scene_of(150, s, silent=0.97) for s in range(3)]}
-    found = compare.method_ratios({"paper": seeds_of(1.0), "map": ours})
-    assert found.left_out == {"map": ["c"]} and found.summary["map.median_rel_ratio"]["n"] == 5
-    assert next(r for r in found.rows if r["scene"] == "c")["median_rel_ratio"] is None
-    bad = seeds_of(0.5) | {"c": [scene_of(150, s, silent=1.1) for s in range(3)]}
-    found = compare.method_ratios({"paper": seeds_of(1.0), "map": bad})
-    assert found.left_out == {"map": ["c"]} and found.unanswered["map.10"] == ["c"]
-    realised = [row["realised_risk_10"] or 0.0 for row in found.rows]
-    assert found.summary["map.realised_risk_10"]["value"] == pytest.approx(statistics.mean(realised))
-
-
-def test_methods_that_do_not_match_raise():
-    paper = seeds_of(1.0)
-    with pytest.raises(ValueError, match=r"compare\.reference: found map, expected paper"):
-        compare.method_ratios({"map": paper})
-    with pytest.raises(ValueError, match=r"compare\.map\.a: found nothing, expected 3 seeds"):
-        compare.method_ratios({"paper": paper, "map": {k: v for k, v in paper.items() if k != "a"}})
-    with pytest.raises(ValueError, match=r"compare\.map\.b: found 2 seeds"):
-        compare.method_ratios({"paper": paper, "map": paper | {"b": paper["b"][:2]}})
-    with pytest.raises(ValueError, match=r"compare\.map\.z: found a scene"):
-        compare.method_ratios({"paper": paper, "map": paper | {"z": paper["b"]}})
+    rows = {row["scene"]: row for row in found.rows}
+    assert (
+        rows["a"]["median_rel_ratio"] == pytest.approx(0.5, abs=0.06)
+        and found.summary["map.median_rel_ratio"]["n"] == 5
+    )
+    assert found.left_out == {"map": ["c"]} and found.unanswered["map.10"] == ["c"] and rows["c"]["aurc_ratio"] is None
+    assert rows["f"]["within_sigma"] < 0.2 and rows["f"]["realised_risk_10"] > 0.2
+    honest = compare.method_ratios({"paper": paper, "map": small(1.0, n=400, names="abcdef", seeds=3)}).summary
+    assert honest["map.within_sigma"]["value"] == pytest.approx(0.683, abs=0.03)
+    assert honest["map.within_2sigma"]["value"] == pytest.approx(0.954, abs=0.02)
+    assert honest["map.ece"]["value"] < 0.06 < honest["map.ece_raw"]["value"]
+    one_room = compare.method_ratios({"paper": small(1.0, names="ef"), "map": small(1.0, names="ef")}, rooms={"e": "f"})
+    assert "within_sigma" not in one_room.rows[0] and one_room.summary["map.ece"]["value"] is None
 
 
 def test_one_method_against_another_with_its_silence():
     """Ratios at equal coverage as in the comparison, the worst of them, and areas in which silence counts as one."""
     ours, theirs = small(0.5, silent=0.1, n=90), small(1.0, silent=0.6, n=90)
-    numbers, rows = compare.multiview_ratios(ours, theirs, "window", draws=50)
-    equal, _ = compare.ratio_over_seeds(
-        *compare.cut_to_equal_coverage(ours, theirs), lambda p: errors.measure_errors(p)["median_rel"]
-    )
-    assert numbers["error_ratio_to_window"].value == pytest.approx(math.prod(equal.values()) ** (1 / 3))
-    assert numbers["worst_scene_ratio_to_window"].value == max(equal.values())
+    numbers, rows = compare.multiview_ratios(ours, theirs, "other", draws=50)
+    cut = compare.cut_to_equal_coverage(ours, theirs)
+    equal, _ = compare.ratio_over_seeds(*cut, median_rel)
+    assert numbers["error_ratio_to_other"].value == pytest.approx(math.prod(equal.values()) ** (1 / 3))
+    assert numbers["worst_scene_ratio_to_other"].value == max(equal.values())
     full = []
     for scene in ours:
+        assert [int(p.keep.sum()) for p in cut[0][scene]] == [int(p.keep.sum()) for p in theirs[scene]]
         areas = [median(risk.measure_risk(p)["aurc_full"] for p in side[scene]) for side in (ours, theirs)]
         full.append(areas[0] / areas[1])
-        assert rows[scene] == {
-            "error_ratio_to_window": equal[scene],
-            "aurc_full_ratio_to_window": pytest.approx(full[-1]),
-        }
-    value = numbers["aurc_full_ratio_to_window"].value
+        assert rows[scene]["error_ratio_to_other"] == equal[scene]
+        assert rows[scene]["aurc_full_ratio_to_other"] == pytest.approx(full[-1])
+    value = numbers["aurc_full_ratio_to_other"].value
     assert value == pytest.approx(math.prod(full) ** (1 / 3)) and value < 0.6
-
-
-def test_a_method_that_is_silent_has_an_area_but_no_error_to_compare():
-    mute = {name: [p.replace(keep=torch.zeros_like(p.keep)) for p in seeds] for name, seeds in small(1.0).items()}
-    numbers, rows = compare.multiview_ratios(mute, small(1.0), "window", draws=20)
-    assert numbers["error_ratio_to_window"].value is None and numbers["worst_scene_ratio_to_window"].value is None
-    assert numbers["aurc_full_ratio_to_window"].value > 1 and all(len(row) == 1 for row in rows.values())
+    mute = {name: [p.replace(keep=torch.zeros_like(p.keep)) for p in seeds] for name, seeds in theirs.items()}
+    numbers, rows = compare.multiview_ratios(mute, theirs, "other", draws=20)
+    assert numbers["error_ratio_to_other"].value is None and numbers["worst_scene_ratio_to_other"].value is None
+    assert numbers["aurc_full_ratio_to_other"].value > 1 and all(len(row) == 1 for row in rows.values())
 
 
 def test_a_target_is_counted_where_a_hundred_answers_are_above_its_threshold():
     n = {name: [scene_of(400, k, spread=0.2)] for k, name in enumerate("abcd")}
-    few = n | {"d": [n["d"][0][:90]]}
-    for scenes, counted in ((n, 4), (few, 3)):
+    for scenes, counted in ((n, 4), (n | {"d": [n["d"][0][:90]]}, 3)):
         found = compare.method_ratios({"paper": scenes, "map": scenes}, draws=20)
         kept = [row["realised_risk_10"] <= 0.1 for row in found.rows if row["n_above_10"] >= 100]
         assert len(kept) == found.summary["map.within_target_10"]["n"] == counted

@@ -13,7 +13,7 @@ from dhtorch.experiments.focal.blur import (
     guess_side_by_height,
     inverse_depth_from_blur,
 )
-from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.thin_lens import depth_of_spot, spot_diameter, spot_gain
 from dhtorch.records import Pose
@@ -173,14 +173,3 @@ def test_a_run_and_its_rows():
     assert row["side_right"] == 1 and row["n_kept"] > 50 and -1 <= row["corr"] <= 1
     assert outcome.scenes("by_colour")["viewpoint_00"]["side_right"] > 0.5, "better than a guess"
     assert "two_sides.ratio" in outcome.summary
-
-
-def test_verdict_goes_either_way():
-    def with_r(oracle, deployed, rho=0.2):
-        common = {"scene": "a", "pair": None, "truth": "full", "role": None, "rho_abs": rho}
-        rows = [{**common, "method": m, "corr": r} for m, r in (("oracle_side", oracle), ("by_height", deployed))]
-        return experiment.verdict(Outcome(rows=rows))[0]
-
-    assert with_r(0.66, 0.06) is True
-    assert with_r(0.66, 0.5) is False and with_r(0.2, 0.0) is False and with_r(0.66, 0.06, rho=0.8) is False
-    assert experiment.verdict(Outcome())[0] is None

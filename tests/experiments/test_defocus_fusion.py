@@ -6,7 +6,7 @@ import torch
 from dhtorch.experiments.focal import defocus_fusion as experiment
 from dhtorch.experiments.focal.blur import BlurMap
 from dhtorch.experiments.focal.filling import fill_bilinear, fill_defocus_guided, fill_guided, fill_joint_bilateral
-from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.experiments.protocol import Settings
 from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
@@ -80,19 +80,3 @@ def test_a_run_and_its_rows():
     assert outcome.summary["defocus_guided.mean_rel_ratio"]["value"] == pytest.approx(
         rows["defocus_guided"]["mean_rel"] / rows["bilinear"]["mean_rel"]
     )
-
-
-def test_verdict_goes_either_way():
-    def said(*pairs):
-        rows = []
-        for k, (ours, plain) in enumerate(pairs):
-            common = {"scene": str(k), "pair": None, "truth": "left_out", "role": None, "corr": 0.9}
-            rows += [
-                {**common, "method": "defocus_guided", "mean_rel": ours},
-                {**common, "method": "bilinear", "mean_rel": plain},
-            ]
-        return experiment.verdict(Outcome(rows=rows))[0]
-
-    assert said((0.03, 0.02), (0.03, 0.02), (0.02, 0.02)) is True
-    assert said((0.03, 0.02), (0.03, 0.02), (0.01, 0.02)) is False, "never lower, says the paper"
-    assert said((0.02, 0.02), (0.02, 0.02)) is None and said() is None

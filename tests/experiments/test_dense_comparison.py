@@ -111,16 +111,6 @@ def test_convoys_are_counted_by_their_role():
     assert found["value"] == pytest.approx(0.2) and found["n"] == 1
 
 
-def test_bars_are_held_one_by_one():
-    fine = {"dense.answered": 0.6, "dense.ause_ratio": 0.4, "dense.within_sigma": 0.7}
-    outcome = Outcome(summary={k: {"value": v} for k, v in fine.items()})
-    holds, why = dense_comparison.verdict(outcome, peers=False)
-    assert holds is None and "3 of 3" in why and "dense.wrong_share" in why
-    outcome.summary["dense.wrong_share"] = {"value": 0.06}
-    holds, why = dense_comparison.verdict(outcome, peers=False)
-    assert holds is False and "dense.wrong_share 0.060 (bar 0.05)" in why
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("tipped", [False, True])
 def test_rectified_matching_is_right_whichever_way_the_other_camera_lies(room, mirrored, tipped):

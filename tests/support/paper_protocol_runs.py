@@ -1,11 +1,13 @@
-"""For the paper's experiments: a configured method, a room of two pairs, outcomes of given rows."""
+"""For the paper's experiments: a configured method, a room of two pairs, outcomes of given rows, errors of probes."""
 
 from functools import cache
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from dhtorch.cli.run import config_dir
+from dhtorch.experiments.probes import probing
 from dhtorch.experiments.protocol import Outcome
 from support.rooms import room as rendered
 
@@ -31,3 +33,15 @@ def outcome_of_rows(*entries):
     """The outcome of an experiment with these rows: (scene, method, truth, measured values) each."""
     base = {"pair": None, "role": None}
     return Outcome(rows=[base | dict(zip(("scene", "method", "truth"), e[:3], strict=True)) | e[3] for e in entries])
+
+
+def probe_errors(spread=0.0, groups=60, cohorts=("all", "moving"), **factors):
+    """Errors of every arm as factors of a base that differs from group to group; ours scatter by ``spread``."""
+    g = torch.Generator().manual_seed(1)
+    base = 1 + torch.rand(groups, generator=g, dtype=torch.float64)
+    scatter = 1 + spread * torch.randn(groups, generator=g, dtype=torch.float64)
+    found = probing.ProbeErrors([str(k) for k in range(groups)])
+    for cohort in cohorts:
+        found.counts[cohort] = torch.ones(groups, dtype=torch.float64)
+        found.squares |= {(arm, cohort): base * x * (scatter if arm == "dhtorch" else 1) for arm, x in factors.items()}
+    return found

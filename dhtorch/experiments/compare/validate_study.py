@@ -191,7 +191,16 @@ def run(
             raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 0")
     selecting_method = with_view_selection(method or next(iter(chosen.values())))
     all_scenes = [scene for scene in scenes_of(scenes) if len(scene.recording) > 1]
-    all_scenes += [Scene(_make_room(seed), near=2.0, gap=6) for seed in rooms]
+    all_scenes += [
+        Scene(
+            SyntheticRoom(
+                n_frames=_WINDOW_FRAMES + 2 * faults.MAX_LAG_FRAMES, hw=(240, 320), seed=seed, name=f"room_{seed}"
+            ),
+            near=2.0,
+            gap=6,
+        )
+        for seed in rooms
+    ]
 
     def evaluate_scene(scene: Scene) -> Outcome:
         load = partial(_load_frame, scene, settings)
@@ -286,7 +295,20 @@ def _reference_row(
     selected, validate = _make_validator(method, scene, near, others, settings, size)
     _, validate_quick = _make_validator(with_view_selection(QUICK_METHOD), scene, near, others, settings, size)
     true_map = _true_map(scene.recording, i, full, size, method)
-    row: Row = {"scene": scene.name, "pair": [i, i], "method": "validate", **_baseline_columns(selected)}
+    hidden = selected.joined.keep & ~selected.samples.usable
+    sigma_rel = (selected.joined.sigma / selected.joined.depth)[hidden]
+    n = int(hidden.sum())
+    median = float(sigma_rel.median()) if n else None
+    row: Row = {
+        "scene": scene.name,
+        "pair": [i, i],
+        "method": "validate",
+        **{
+            "n_answers": n,
+            "stated": median,
+            "baseline": n >= _MIN_BASELINE_ANSWERS and median is not None and median <= _MAX_BASELINE_SIGMA_REL,
+        },
+    }
     for name, factor in {"none": 1.0, **_SCALE_FAULTS}.items():
         validation, quick = (check(true_map * factor, views=False) for check in (validate, validate_quick))
         scale = {"scale": validation.scale[0], "scale_far": validation.scale_far[0], "quick_far": quick.scale_far[0]}
@@ -398,18 +420,6 @@ def _pixel_counts(name: str, faulty: Tensor, true_map: Tensor, score: Tensor, st
         hidden = answered & ~has_return
         row["auroc"] = auroc(score[hidden], wrong[hidden])
     return row
-
-
-def _baseline_columns(selected: dense.SelectedViews) -> Row:
-    hidden = selected.joined.keep & ~selected.samples.usable
-    sigma_rel = (selected.joined.sigma / selected.joined.depth)[hidden]
-    n = int(hidden.sum())
-    median = float(sigma_rel.median()) if n else None
-    return {
-        "n_answers": n,
-        "stated": median,
-        "baseline": n >= _MIN_BASELINE_ANSWERS and median is not None and median <= _MAX_BASELINE_SIGMA_REL,
-    }
 
 
 def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
@@ -572,12 +582,6 @@ def _true_map(recording: Recording, i: int, full: Frame, size: int, method: Meth
         return _depth_over_image(exact, size)
     samples = method.backproject(full, dense.map_pixel_centres(full, hw))
     return torch.where(samples.depth > 0, samples.depth, 0.0).unflatten(1, hw)
-
-
-def _make_room(seed: int) -> SyntheticRoom:
-    return SyntheticRoom(
-        n_frames=_WINDOW_FRAMES + 2 * faults.MAX_LAG_FRAMES, hw=(240, 320), seed=seed, name=f"room_{seed}"
-    )
 
 
 def _evenly_spaced(n: int, count: int) -> list[int]:

@@ -180,7 +180,9 @@ def _evaluate_frame(
     compared = left_out & (truth > 0)
     for estimate in filled.values():
         compared = compared & (estimate > 0)
-    edge = _edge_mask(truth)[compared]
+    high = torch.nn.functional.max_pool2d(truth, 5, 1, 2)
+    low = -torch.nn.functional.max_pool2d(-torch.where(truth > 0, truth, torch.inf), 5, 1, 2)
+    edge = (high > (1 + _EDGE_SPREAD) * low)[compared]
     return {
         name: _error_metrics(estimate[compared].double(), truth[compared].double(), plain[compared].double(), edge)
         for name, estimate in filled.items()
@@ -201,13 +203,6 @@ def _error_metrics(x: Tensor, y: Tensor, plain: Tensor, edge: Tensor) -> Row:
         "edge_mean_rel": float(error[edge].mean()) if has_edge else None,
         "changed_rel": float(((x - plain).abs() / plain).mean()) if has_pixels else None,
     }
-
-
-def _edge_mask(depth: Tensor) -> Tensor:
-    """Depth edges (B, H, W): returns in 5×5 pixels spread by more than :data:`_EDGE_SPREAD`."""
-    high = torch.nn.functional.max_pool2d(depth, 5, 1, 2)
-    low = -torch.nn.functional.max_pool2d(-torch.where(depth > 0, depth, torch.inf), 5, 1, 2)
-    return high > (1 + _EDGE_SPREAD) * low
 
 
 def _add_ratios(outcome: Outcome) -> None:

@@ -203,7 +203,16 @@ def render_stacks(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed
         return (x + levels / 255 * torch.randn(x.shape, generator=generator).to(x)).clamp(0, 1)
 
     noisy = add_noise(clean, 4)
-    moved = add_noise(_jitter(clean, generator), 1)
+    # Stack (B, S, C, H, W) with magnification changing by 2 % in all and random shifts of about a pixel
+    B, S, _, H, W = clean.shape
+    zoom = 1 + torch.linspace(-0.01, 0.01, S)
+    shift = torch.randn(S, 2, generator=generator)
+    theta = torch.zeros(S, 2, 3)
+    theta[:, 0, 0] = theta[:, 1, 1] = zoom
+    theta[:, :, 2] = shift * 2 / torch.tensor([W, H])
+    grid = torch.nn.functional.affine_grid(theta.to(clean), [S, 1, H, W], align_corners=False)
+    options: dict[str, Any] = {"mode": "bicubic", "padding_mode": "border", "align_corners": False}
+    moved = add_noise(torch.stack([torch.nn.functional.grid_sample(clean[b], grid, **options) for b in range(B)]), 1)
     return {
         "clean": clean,
         "noisy": noisy,
@@ -370,16 +379,3 @@ def _sort_by_focus(stack: FocalStack) -> FocalStack:
         return stack
     order = stack.focus_m[0].argsort()
     return stack.replace(images=stack.images[:, order], focus_m=stack.focus_m[:, order])
-
-
-def _jitter(images: Tensor, generator: torch.Generator) -> Tensor:
-    """Stack (B, S, C, H, W) with magnification changing by 2 % in all and random shifts of about a pixel."""
-    B, S, _, H, W = images.shape
-    zoom = 1 + torch.linspace(-0.01, 0.01, S)
-    shift = torch.randn(S, 2, generator=generator)
-    theta = torch.zeros(S, 2, 3)
-    theta[:, 0, 0] = theta[:, 1, 1] = zoom
-    theta[:, :, 2] = shift * 2 / torch.tensor([W, H])
-    grid = torch.nn.functional.affine_grid(theta.to(images), [S, 1, H, W], align_corners=False)
-    options: dict[str, Any] = {"mode": "bicubic", "padding_mode": "border", "align_corners": False}
-    return torch.stack([torch.nn.functional.grid_sample(images[b], grid, **options) for b in range(B)])

@@ -65,7 +65,9 @@ def read(
         raise FormatError(root, "option split", split, "train or val")
     if max_depth is not None:
         files.to_positive(max_depth, root, "option max_depth")
-    samples = {k: v for k, v in _samples(root).items() if split in (None, _split(k))}
+    samples = {
+        k: v for k, v in _samples(root).items() if split in (None, "val" if int(k) >= _FIRST_VALIDATION else "train")
+    }
     has_depth = any(depths for _, depths in samples.values())
     complete = {k: v for k, v in samples.items() if (len(v[0]), len(v[1])) == (len(focus), int(has_depth))}
     if not complete:
@@ -116,8 +118,3 @@ def _samples(root: Path) -> dict[str, tuple[list[Path], list[Path]]]:
         if match := _SAMPLE_PATTERN.fullmatch(file.name):
             samples.setdefault(match[1], ([], []))[match[2] == "Dpt.exr"].append(file)
     return samples
-
-
-def _split(index: str) -> str:
-    """Split of a sample index."""
-    return "val" if int(index) >= _FIRST_VALIDATION else "train"

@@ -187,7 +187,18 @@ class ProbeShards:
         wanted = set(groups)
         for k, (group, file) in enumerate(self._files):
             if group in wanted:
-                yield self._with_controls(self._load(file), k)
+                # Shard ``k`` with ``true_motion``, its targets with noise, and ``shuffled``, the
+                # depth features of the shard half of all shards away: of other samples, elsewhere
+                shard = self._load(file)
+                generator = torch.Generator().manual_seed(k)
+                noise = torch.randn(shard.target.shape, generator=generator, dtype=torch.float64)
+                blocks = {**shard.blocks, POSITIVE_CONTROL: shard.target + CONTROL_NOISE * self.target_spread() * noise}
+                if NEGATIVE_CONTROL in self.widths:
+                    other = self._load(self._files[(k + len(self._files) // 2) % len(self._files)][1]).blocks[
+                        _SHUFFLED_BLOCK
+                    ]
+                    blocks[NEGATIVE_CONTROL] = other[torch.arange(len(shard.target)) % max(len(other), 1)]
+                yield replace(shard, blocks=blocks)
 
     def target_spread(self) -> Tensor:
         """Standard deviations (D,) of the targets over all samples; 1 for a constant target."""
@@ -195,17 +206,6 @@ class ProbeShards:
             raise ValueError("probe: found no sample")
         variance = self._targets.yy / self._targets.n.clamp_min(1)
         return torch.where(variance > 0, variance, 1.0).sqrt()
-
-    def _with_controls(self, shard: ProbeShard, k: int) -> ProbeShard:
-        """Shard ``k`` with ``true_motion``, its targets with noise, and ``shuffled``, the depth features of the shard
-        half of all shards away: of other samples, elsewhere."""
-        generator = torch.Generator().manual_seed(k)
-        noise = torch.randn(shard.target.shape, generator=generator, dtype=torch.float64)
-        blocks = {**shard.blocks, POSITIVE_CONTROL: shard.target + CONTROL_NOISE * self.target_spread() * noise}
-        if NEGATIVE_CONTROL in self.widths:
-            other = self._load(self._files[(k + len(self._files) // 2) % len(self._files)][1]).blocks[_SHUFFLED_BLOCK]
-            blocks[NEGATIVE_CONTROL] = other[torch.arange(len(shard.target)) % max(len(other), 1)]
-        return replace(shard, blocks=blocks)
 
     def columns(self, blocks: Sequence[str]) -> Tensor:
         """Column indices of the named blocks among all features: (f,) int64."""

@@ -139,7 +139,10 @@ def run(
         blocks_of = [(s, split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members))))) for s in members]
         note = _reason_to_leave_out([block for _, scene_blocks in blocks_of for block in scene_blocks], min_pairs)
         if note:
-            outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
+            outcome.rows += [
+                {"scene": room, "pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None, "note": note}
+                for arm in arm_names
+            ]
         else:
             probed.setdefault(_ALL_ROOMS if hold_out == "rooms" else room, []).extend(blocks_of)
     needed: dict[str, int | None] = {}
@@ -336,11 +339,6 @@ class _PairFeatures:
 def _positions(block: Sequence[tuple[int, int]]) -> list[int]:
     """Positions of the frames of a block of pairs, each once, in order."""
     return sorted({k for pair in block for k in pair})
-
-
-def _empty_row(scene: str, arm: str, note: str) -> Row:
-    """Row of a scene that was left out, with the reason as its note."""
-    return {"scene": scene, "pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None, "note": note}
 
 
 def _format_interval(row: Row) -> str:
