@@ -149,20 +149,6 @@ def test_sides():
     )
 
 
-def test_bad_input():
-    lens, depth = make_lens(400.0), torch.ones(1, 8, 8)
-    with pytest.raises(ValueError, match="depth has shape"):
-        render_defocus(torch.zeros(1, 1, 8, 9), depth, lens, torch.ones(1, 1))
-    with pytest.raises(ValueError, match="without a value"):
-        render_defocus(torch.zeros(1, 1, 8, 8), 0 * depth, lens, torch.ones(1, 1))
-    with pytest.raises(ValueError, match="beyond the focal length"):
-        render_defocus(torch.zeros(1, 1, 8, 8), depth, lens, torch.full((1, 1), 0.01))
-    with pytest.raises(ValueError, match="expected 0 < fine_px < coarse_px"):
-        estimate_blur(torch.zeros(1, 1, 8, 8), fine_px=2.0, coarse_px=1.0)
-    with pytest.raises(ValueError, match="expected at least 1"):
-        open_viewpoints(0)
-
-
 @pytest.mark.slow
 def test_a_run_and_its_rows():
     views = open_viewpoints(1, hw=(120, 160))

@@ -60,17 +60,6 @@ def test_exact_defocus_corrects_an_edge_and_useless_defocus_changes_little():
     assert torch.equal(nothing, plain)
 
 
-def test_bad_input():
-    for bad in (0, 4):
-        with pytest.raises(ValueError, match="expected an odd number from 3"):
-            experiment.run([], {}, None, Settings(), factor=bad)
-    with pytest.raises(ValueError, match="coarse has shape"):
-        fill_bilinear(torch.ones(4, 4), (8, 8))
-    for guided in (fill_guided, fill_joint_bilateral):
-        with pytest.raises(ValueError, match="guide has shape"):
-            guided(torch.ones(1, 4, 4), torch.ones(1, 8, 9))
-
-
 def test_a_run_and_its_rows():
     outcome = experiment.run(open_viewpoints(1, hw=(120, 160)), {}, None, Settings())
     rows = {r["method"]: r for r in outcome.rows if r["pair"] is None}

@@ -99,24 +99,6 @@ def test_known_motion_is_found_and_undone():
     assert torch.equal(aligned[:, 0], moved[:, 0])
 
 
-def test_bad_stacks():
-    one = torch.zeros(1, 1, 1, 32, 32)
-    for fn in (measure_sharpness, align_stack):
-        with pytest.raises(ValueError, match="found 1 picture, expected a stack of at least two"):
-            fn(one)
-    with pytest.raises(ValueError, match="measure is 'fourier', expected one of modified_laplacian"):
-        measure_sharpness(torch.zeros(1, 3, 1, 32, 32), "fourier")
-    place = torch.ones(1, 4, 4)
-    with pytest.raises(ValueError, match="focus_m is None, expected distances"):
-        depth_at_focus(place, None)
-    with pytest.raises(ValueError, match="rise or to fall throughout"):
-        depth_at_focus(place, torch.tensor([[1.0, 3.0, 2.0]]))
-    with pytest.raises(ValueError, match="reference is 7"):
-        align_stack(torch.zeros(1, 3, 1, 32, 32), reference=7)
-    with pytest.raises(ValueError, match="slices: found 1"):
-        experiment.run([], {}, None, Settings(), slices=1)
-
-
 def given(outcome):
     return outcome.scenes("given")
 

@@ -87,12 +87,6 @@ def test_percentiles():
     assert latency.percentile([1.0, 2.0], 0.5) == 1.5 and latency.percentile([7.0], 0.99) == 7
 
 
-def test_wrong_counts_raise():
-    for wrong in ({"rounds": 0}, {"sizes": ()}, {"n": 0}):
-        with pytest.raises(ValueError, match=f"experiment.{next(iter(wrong))}"):
-            measured(**wrong)
-
-
 def hungry(x, mib):
     return x.sum() + (x.new_ones(mib * 2**20 // x.element_size()) + 1).sum()
 

@@ -121,5 +121,3 @@ def test_one_room_is_not_enough_and_several_views_are_refused(rooms):
     assert outcome.verdict == "undecided" and "two rooms" in outcome.why
     (row,) = outcome.scenes("learned").values()
     assert row["note"] == "no other room to learn from"
-    with pytest.raises(ValueError, match="two views"):
-        learned_score.run(rooms[:1], {"window": MAP.replace(views=3)}, by_gap, Settings())

@@ -153,11 +153,6 @@ def test_silent_and_left_out_scenes_are_named():
     assert "without ratio: terrace" in why and "map.5 % risk: no answer on desk" in why
 
 
-def test_nothing_to_compare_is_an_error():
-    with pytest.raises(ValueError, match=r"experiment\.methods: found paper, opencv"):
-        method_comparison.run([], {}, by_gap, Settings(), methods={"paper": method(), "opencv": method("opencv")})
-
-
 @pytest.mark.slow
 def test_a_method_that_chooses_is_offered_the_frames_around_and_held_against_the_window():
     rooms = open_rooms(("walk", "lateral"), n_frames=7, hw=(192, 256), gap=3, lidar="exact")
@@ -290,5 +285,3 @@ def test_fixed_gaps_chains_and_further_ratios():
         for k in ("coverage", "error", "equal_error")
         for pair in (f"twin.{k}_ratio_to_paper", f"map_chain.{k}_ratio_to_map")
     }
-    with pytest.raises(ValueError, match=r"experiment.chained: found none, expected some of"):
-        method_comparison.run([], methods, by_gap, Settings(), chained=["none"])

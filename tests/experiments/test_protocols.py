@@ -330,22 +330,6 @@ def test_ablation_changes_one_thing_at_a_time():
     assert ratio == pytest.approx(ours / base)
 
 
-def test_drop_outs_and_halves_refuse_wrong_shapes():
-    frame, samples = (
-        small_room()[0],
-        HeldOut(configured_method(), Settings()).whole(
-            batch_of(small_room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
-        ),
-    )
-    truth = holdout.sample_truth(frame, samples.uv)
-    with pytest.raises(ValueError, match="select_real_holes"):
-        holdout.select_real_holes(frame, samples, truth[:, :5])
-    with pytest.raises(ValueError, match=r"holdout.share: found 1"):
-        holdout.split_half(samples, 0, share=1)
-    with pytest.raises(ValueError, match="hide_returns"):
-        holdout.hide_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
-
-
 #: Where the built-in rooms are not what an experiment asks for, or its own sizes are those of a measurement.
 SMALLER = {
     "ablation": ["experiment.n=[128]", "experiment.windows=[15]"],
