@@ -441,7 +441,7 @@ def main() -> int:
     for row in try_all(faults, json.loads(args.lines.read_text()), args.tests, args.jobs):
         rows.append({**row, "seed": seed})
         if args.json:  # at once: what was tried in an hour is not lost with the next
-            args.json.write_text(json.dumps(rows, indent=1) + "\n")
+            args.json.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     for name, caught, total in summarize(rows):
         print(f"{name:45} {caught:4} of {total:4} = {caught / total:.0%}")
     return 0

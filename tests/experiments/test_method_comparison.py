@@ -5,7 +5,6 @@ from functools import partial
 
 import pytest
 import torch
-from dhtorch.calibration import load_calibration
 from hydra import compose as compose_settings
 from hydra import initialize_config_dir
 from hydra.utils import instantiate
@@ -18,6 +17,7 @@ from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments.compare import method_comparison
 from dhtorch.experiments.protocol import Settings
 from dhtorch.metrics import errors, uncertainty
+from dhtorch.metrics.calibration import load_calibration
 from dhtorch.records import Estimate
 from dhtorch.synthetic.recording import open_rooms
 from dhtorch.synthetic.stress import STRESSES

@@ -189,7 +189,7 @@ def run(
         for scene, row in outcome.scenes(name).items():
             row.update(against_by_scene.get(scene, {}))  # none where there were too few candidates
     for numbers in comparison.rows:
-        row = outcome.scenes(numbers["method"])[numbers["scene"]]
+        row = outcome.scenes(str(numbers["method"]))[str(numbers["scene"])]
         row[f"against_{reference}"] = {k: v for k, v in numbers.items() if k not in ("scene", "method")}
     without_sigma = {name for name in compared if not methods[name].states_sigma}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several), agreement, without_sigma))
