@@ -56,8 +56,6 @@ EXPERIMENTS = {
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "uncertainty_study": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=1 "
     "experiment.disjoint=[auto]",
-    "uncertainty_study_streams": f"experiment=method_comparison data=streams {WITHOUT_SLOW} experiment.seeds=1 "
-    "experiment.disjoint=[auto]",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
     "validate_study": "experiment=validate_study data=shared_scenes",
     "validate_study_streams": "experiment=validate_study data=streams experiment.rooms=[]",
