@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from support.box_scene import CAMERA, HW, off_wall, pose, render, world_points
+from support.capture_cases import DELETE, Case, check_case
 from support.robot_episodes import two_episodes
 
 pytest.importorskip("av")
@@ -83,12 +84,6 @@ def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
     write_lerobot(tmp_path, two_episodes())
     same_scene(data.open(tmp_path, episode=1, camera=KEY), two_episodes()[1], STEP["video"])
     assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
-    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those requested, expected \[7\]"):
-        data.open(tmp_path, episode=7)
-    with pytest.raises(
-        FormatError, match=r"info.json: cameras: found wrist, expected some of observation.images.front"
-    ):
-        data.open(tmp_path, camera="wrist")
 
 
 @pytest.mark.parametrize("version", [3, 2])
@@ -138,13 +133,6 @@ def with_column(name: str, value: int, table: pyarrow.Table) -> pyarrow.Table:
     return table.set_column(table.schema.get_field_index(name), name, pyarrow.array([value] * len(table)))
 
 
-@pytest.mark.parametrize("depth_pixels", ["gray12le", "yuv420p12le"])
-def test_depth_codes_survive_both_pixel_formats(tmp_path: Path, depth_pixels: str) -> None:
-    """A conversion of yuv420p12le to grey would stretch its range: codes are read as they stand."""
-    write_lerobot(tmp_path, two_episodes(), depth_pixels=depth_pixels)
-    same_scene(data.open(tmp_path, episode=0), two_episodes()[0], STEP["video"])
-
-
 def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
     frame = two_episodes()[0][0]
     depth = frame.depth.clone()
@@ -158,18 +146,6 @@ def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
     assert torch.equal(cut, torch.where((got >= 0.5) & (got <= 3), got, torch.zeros_like(got))) and bool(
         (cut != got).any()
     )
-
-
-def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes())
-
-    def older(info: dict[str, Any]) -> None:
-        feature = info["features"].pop(f"{KEY}_depth")
-        feature["info"] = {f"video.{k}" if k == "is_depth_map" else k: v for k, v in feature["info"].items()}
-        info["features"][f"{KEY}_depth"] = feature
-
-    edit(tmp_path, older)
-    same_scene(data.open(tmp_path, episode=0), two_episodes()[0], STEP["video"])
 
 
 @pytest.mark.parametrize("log", [True, False])
@@ -206,20 +182,6 @@ def test_writer_codes_by_the_published_rule() -> None:
     np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
 
 
-def test_depth_unit_of_pictures(tmp_path: Path) -> None:
-    """Without a unit in the info whole numbers are mm and others m; the info and the option win."""
-    write_lerobot(tmp_path, two_episodes(), depth="png")
-    exact = data.open(tmp_path, episode=0)[0].depth
-    torch.testing.assert_close(data.open(tmp_path, episode=0, depth_unit="m")[0].depth, exact * 1000)
-    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="m"))
-    torch.testing.assert_close(data.open(tmp_path, episode=0)[0].depth, exact * 1000)
-    for unit in ("ft", 1000, ["m"], {"m": 1}):
-        change = {"depth_unit": unit}
-        edit(tmp_path, lambda info, change=change: info["features"][f"{KEY}_depth"]["info"].update(change))
-        with pytest.raises(FormatError, match=r"depth_unit: found .*, expected one of m, cm, mm, inch"):
-            data.open(tmp_path, episode=0)[0]
-
-
 @pytest.mark.parametrize("depth", ["video", "png"])
 def test_depth_without_a_flag_is_recognised_by_its_pixels(depth: str, tmp_path: Path) -> None:
     write_lerobot(tmp_path, two_episodes(), depth=depth)
@@ -232,19 +194,6 @@ def test_depth_without_a_flag_is_recognised_by_its_pixels(depth: str, tmp_path: 
     assert unflagged.report == (remark,) and flagged.report == ()
     assert data.open(tmp_path, episode=0, depth=f"{KEY}_depth").report == ()
     assert unflagged.depth_unit == flagged.depth_unit == (None if depth == "video" else DepthUnit(1e-3))
-
-
-def test_depth_whose_shape_counts_three_channels_is_recognised_by_its_format(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), depth="video")
-    flagged = data.open(tmp_path, episode=0)
-
-    def change(info: dict[str, Any]) -> None:
-        feature = info["features"][f"{KEY}_depth"]
-        feature["shape"] = [*feature["shape"][:2], 3]
-        feature["info"] |= {"is_depth_map": False, "video.pix_fmt": "gray12le"}
-
-    edit(tmp_path, change)
-    assert torch.equal(data.open(tmp_path, episode=0)[1].depth, flagged[1].depth)
 
 
 def test_a_grey_camera_of_8_bits_is_no_depth(tmp_path: Path) -> None:
@@ -292,38 +241,6 @@ def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 # -------------------------------------------------------------------------------------------------- intrinsics, depth
 
 
-def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), intrinsics=None)
-    with pytest.raises(
-        FormatError, match=r"observation.images.front: found no intrinsics, expected data.fov=69 .*meta/intrinsics.json"
-    ):
-        data.open(tmp_path, episode=0)
-    camera = data.open(tmp_path, episode=0, K=[61.5, 58.25, 33.5, 21.75], distortion=[0.1, 0, 0, 0])[0].camera
-    assert torch.equal(camera.f, CAMERA.f) and torch.equal(camera.c, CAMERA.c) and float(camera.distortion[0, 0]) > 0
-    side = {KEY: {"K": [[50, 0, 30], [0, 50, 20], [0, 0, 1]], "dist": [0.1, 0.01, 0, 0, 0], "K_depth": [[70, 0, 31], [0, 66, 23], [0, 0, 1]]}}  # fmt: skip
-    (tmp_path / "meta" / "intrinsics.json").write_text(json.dumps(side))
-    frame = data.open(tmp_path, episode=0)[0]
-    assert frame.camera.f.tolist() == [[50, 50]] and frame.camera.distortion.shape == (1, 5)
-    assert frame.depth_camera.f.tolist() == [[70, 66]]
-    assert data.open(tmp_path, episode=0, K_depth=[71, 66, 31, 23])[0].depth_camera.f.tolist() == [[71, 66]]
-    with pytest.raises(FormatError, match=r"option intrinsics: found x, expected one of"):
-        data.open(tmp_path, episode=0, intrinsics="x")
-    with pytest.raises(FormatError, match=r"options: found data.K and data.fov, expected one of them"):
-        data.open(tmp_path, episode=0, K=[1, 1, 1, 1], fov=60)
-
-
-def test_one_option_says_K_in_three_ways(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), intrinsics=None)
-    four = data.open(tmp_path, episode=0, intrinsics=[61.5, 58.25, 33.5, 21.75])
-    assert torch.equal(four[0].camera.f, CAMERA.f) and not any("guess" in line for line in four.report)
-    with pytest.warns(UserWarning, match="are a guess"):
-        wide = data.open(tmp_path, episode=0, intrinsics=90)
-    assert float(wide[0].camera.f[0, 0]) == pytest.approx(HW[1] / 2) and any("guess" in line for line in wide.report)
-    for bad in (0, 179, True):
-        with pytest.raises(FormatError, match="1 to 179 degrees"):
-            data.open(tmp_path, episode=0, fov=bad)
-
-
 def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
     write_lerobot(tmp_path, [two_episodes()[0]], version=2)
     info = tmp_path / "meta" / "info.json"
@@ -339,29 +256,6 @@ def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
     both = data.open_all(tmp_path, camera=["observation.images.left", KEY], K=[60, 60, 30, 20])
     assert [r.name.rpartition("/")[2] for r in both] == ["left", "front"]
     assert torch.equal(both[0][0].image, both[1][0].image)
-
-
-def test_K_may_change_from_frame_to_frame(tmp_path: Path) -> None:
-    lenses = [Camera(CAMERA.f + i, CAMERA.c) for i in range(3)]
-    shots = [render(camera, pose(i), HW, i / 30) for i, camera in enumerate(lenses)]
-    write_lerobot(tmp_path, [two_episodes()[0], shots])
-    same_scene(data.open(tmp_path, episode=1), shots, STEP["video"])
-
-
-def test_depth_is_the_one_named_like_the_camera(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), depth="array")
-    other = {"dtype": "image", "shape": [*HW, 3], "info": {}}
-    edit(tmp_path, lambda info: info["features"].update({"observation.images.wrist": other}))
-    recording = data.open(tmp_path, episode=0, camera=KEY)
-    assert recording.report == () and recording[0].depth.any()
-    edit(tmp_path, lambda info: info["features"].update({"side_depth": info["features"].pop(f"{KEY}_depth")}))
-    recording = data.open(tmp_path, episode=0, camera=KEY)
-    assert recording.report == (f"{KEY}: no depth feature: depth is empty",)
-    assert not recording[0].depth.any() and recording[0].depth.shape == (1, *HW)
-    with pytest.raises(FormatError, match=r"side_depth, expected|columns"):
-        data.open(tmp_path, episode=0, camera=KEY, depth="side_depth")[0]
-    with pytest.raises(FormatError, match=r"option depth: found nothing_there"):
-        data.open(tmp_path, episode=0, camera=KEY, depth="nothing_there")
 
 
 # ------------------------------------------------------------------------------------------------------- rows and time
@@ -384,18 +278,6 @@ def test_episodes_are_not_told_from_the_stamps(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"time 0.100200 s: found nearest frame at 0.100000 s, expected one within"):
         data.open(tmp_path, episode=1)[0]
     assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, two_episodes()[1][1].image)
-
-
-def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), version=2)
-    file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
-    rewrite(file, lambda t: t.take([0, 1, 3]))
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 1, 3] and "3 rows, 4 according to meta/episodes" in recording.report[0]
-    assert torch.equal(recording[2].image, two_episodes()[1][3].image)
-    rewrite(file, lambda t: t.take([0, 2, 1]))
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 3] and "1 row out of order: left out" in recording.report[0]
 
 
 def rewrite_video(root: Path, pictures: list[int], stamps: list[float] | None = None) -> None:
@@ -453,17 +335,6 @@ def test_a_capture_keeps_its_clock_where_that_increases(monkeypatch, written, nu
     assert found[0].tolist() == numbers and (found[1] is None if times is None else found[1].tolist() == times)
 
 
-def test_a_wrong_stamp_does_not_reorder_numbered_rows(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
-    file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
-    wrong = pyarrow.array(np.array([0, 9, 2 / 30, 3 / 30], np.float32))
-    rewrite(file, lambda t: t.set_column(t.schema.get_field_index("timestamp"), "timestamp", wrong))
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 1, 2, 3]
-    torch.testing.assert_close(recording.times, torch.arange(4).double() / 30)
-    assert "1 time stamp out of order: rows keep the order of their numbers" in recording.report[0]
-
-
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lerobot(tmp_path, two_episodes(), image="image", depth="tiff")
     asked: list[str] = []
@@ -476,30 +347,120 @@ def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert asked.count(KEY) == 2 == asked.count(f"{KEY}_depth")  # four rows in two row groups
 
 
+INFO, SIDE = "meta/info.json", "meta/intrinsics.json"
+TABLE = "data/chunk-000/episode_000001.parquet"
+DEPTH = f"{KEY}_depth"
+FIRST, SECOND = (lambda: two_episodes()[0]), (lambda: two_episodes()[1])
+
+
+def write_both(root: Path, _frames: list[Frame], **options: Any) -> None:
+    write_lerobot(root, two_episodes(), **options)
+
+
+def lenses() -> list[Frame]:
+    """Frames of cameras that change."""
+    return [render(Camera(CAMERA.f + i, CAMERA.c), pose(i), HW, i / 30) for i in range(3)]
+
+
+def set_case(name: str, edits: Any = (), expect: Any = None, *, frames: Any = FIRST, **more: Any) -> Case:
+    options = {"episode": 1 if frames is SECOND else 0} | more.pop("options", {})
+    return Case(name, write_both, frames, edits, expect or {}, options=options, **more)
+
+
+def feature(key: str, **change: Any) -> tuple[str, Any]:
+    return INFO, {"features": {key: change}}
+
+
+def column(name: str, values: list[float]) -> Any:
+    """An edit of a table."""
+    cells = pyarrow.array(np.array(values, np.float32))
+    return lambda table: table.set_column(table.schema.get_field_index(name), name, cells)
+
+
+def odd_tracks(info: dict[str, Any]) -> tuple[str, Any]:
+    return feature(DEPTH, info=info)
+
+
+NO_K = {"intrinsics": None}
+SIDE_CAR = {KEY: {"K": [[50, 0, 30], [0, 50, 20], [0, 0, 1]], "dist": [0.1, 0.01, 0, 0, 0],
+                  "K_depth": [[70, 0, 31], [0, 66, 23], [0, 0, 1]]}}  # fmt: skip
+ALL = {"same": ([0, 1], 3e-3), "report": ()}
+WRIST = {"dtype": "image", "shape": [*HW, 3], "info": {}}
+V2 = {"version": 2}
+
+CASES = [
+    *(set_case(f"codes in {pixels}", (), ALL, written={"depth_pixels": pixels})
+      for pixels in ("gray12le", "yuv420p12le")),
+    set_case("the older flag of depth", [odd_tracks({"is_depth_map": DELETE, "video.is_depth_map": True})], ALL),
+    set_case("a shape of three channels",
+             [odd_tracks({"is_depth_map": False, "video.pix_fmt": "gray12le"}), feature(DEPTH, shape={2: 3})],
+             {"same": ([0, 1], 3e-3)}),
+    set_case("millimetres", (), {"unit": (1e-3, None), "same": ([0, 1], 1e-3)}, written={"depth": "png"}),
+    set_case("metres by option", (), {"same": ([0, 1], 1e-3, 1000)}, written={"depth": "png"},
+             options={"depth_unit": "m"}),
+    set_case("metres by info", [odd_tracks({"depth_unit": "m"})],
+             {"unit": (1.0, f"{INFO}: {DEPTH} depth_unit"), "same": ([0, 1], 1e-3, 1000)}, written={"depth": "png"}),
+    *(set_case(f"unit {unit}", [odd_tracks({"depth_unit": unit})], written={"depth": "png"},
+               error=r"depth_unit: found .*, expected one of m, cm, mm, inch") for unit in ("ft", 1000, ["m"])),
+    # intrinsics
+    set_case("no K", written=NO_K,
+             error=r"observation.images.front: found no intrinsics, expected data.fov=69 .*meta/intrinsics.json"),
+    set_case("K and lens by option", (), {"f": CAMERA.f[0].tolist(), "lens": pytest.approx([0.1, 0, 0, 0])},
+             written=NO_K, options={"K": [61.5, 58.25, 33.5, 21.75], "distortion": [0.1, 0, 0, 0]}),
+    set_case("K in the side-car", [(SIDE, json.dumps(SIDE_CAR))],
+             {"f": [50, 50], "depth f": [70, 66], "lens": pytest.approx([0.1, 0.01, 0, 0, 0])}, written=NO_K),
+    set_case("K of depth by option", [(SIDE, json.dumps(SIDE_CAR))], {"depth f": [71, 66]}, written=NO_K,
+             options={"K_depth": [71, 66, 31, 23]}),
+    set_case("an unknown feature", written=NO_K, options={"intrinsics": "x"},
+             error=r"option intrinsics: found x, expected one of"),
+    set_case("two options", written=NO_K, options={"K": [1, 1, 1, 1], "fov": 60},
+             error=r"options: found data.K and data.fov, expected one of them"),
+    set_case("four numbers", (), {"f": CAMERA.f[0].tolist(), "report": ()}, written=NO_K,
+             options={"intrinsics": [61.5, 58.25, 33.5, 21.75]}),
+    set_case("degrees", (), {"f": pytest.approx([HW[1] / 2] * 2), "report": ["guess"]}, written=NO_K,
+             options={"intrinsics": 90}),
+    *(set_case(f"fov {fov}", written=NO_K, options={"fov": fov}, error="1 to 179 degrees") for fov in (0, 179, True)),
+    Case("K changes from frame to frame", lambda root, frames: write_lerobot(root, [two_episodes()[0], frames]), lenses,
+         (), {"all f": [61.5, 62.5, 63.5], "same": ([0, 1, 2], 3e-3)}, options={"episode": 1}),
+    # cameras and depth
+    set_case("depth named like its camera", [(INFO, {"features": {"observation.images.wrist": WRIST}})],
+             {"report": (), "empty": [False, False]}, written={"depth": "array"}, options={"camera": KEY}),
+    *(set_case(f"depth of another name, {depth}", [
+        (INFO, [(f'"{DEPTH}"', '"side_depth"')]), (INFO, {"features": {"observation.images.wrist": WRIST}})], expect,
+        written={"depth": "array"}, options={"camera": KEY} | ({"depth": depth} if depth else {}), error=error)
+      for depth, expect, error in (
+          (None, {"report": (f"{KEY}: no depth feature: depth is empty",), "empty": [True, True], "depth hw": HW}, None),
+          ("side_depth", None, r"side_depth, expected|columns"),
+          ("nothing_there", None, r"option depth: found nothing_there"))),
+    set_case("no such episode", options={"episode": 7},
+             error=r"meta: episodes: found 0 of those requested, expected \[7\]"),
+    set_case("no such camera", options={"camera": "wrist"},
+             error=r"info.json: cameras: found wrist, expected some of observation.images.front"),
+    # rows
+    set_case("a row is missing", [(TABLE, lambda t: t.take([0, 1, 3]))],
+             {"number": [0, 1, 3], "report": ["3 rows, 4 according to meta/episodes"], "same": ([0, 1, 3], 3e-3)},
+             frames=SECOND, written=V2),
+    set_case("rows out of order", [(TABLE, lambda t: t.take([0, 1, 3])), (TABLE, lambda t: t.take([0, 2, 1]))],
+             {"number": [0, 3], "report": ["1 row out of order: left out", ""]}, frames=SECOND, written=V2),
+    set_case("a wrong stamp", [(TABLE, column("timestamp", [0, 9, 2 / 30, 3 / 30]))],
+             {"number": [0, 1, 2, 3], "times": pytest.approx([0, 1 / 30, 2 / 30, 3 / 30]),
+              "report": ["1 time stamp out of order: rows keep the order of their numbers", ""]}, frames=SECOND,
+             written=V2 | {"depth": None}),
+    *(set_case(f"info {key} {value}", [(INFO, {key: value})], error=rf"info.json: {key}", written={"depth": None})
+      for key, value in (
+          ("data_path", "../{chunk_index:03d}.parquet"), ("data_path", "/etc/{chunk_index:03d}.parquet"),
+          ("data_path", "{chunk_index.__class__}.parquet"), ("data_path", "{chunk_index:0999999999d}.parquet"),
+          ("data_path", "{other}.parquet"), ("video_path", "{video_key:03d}"), ("codebase_version", "v1.6"),
+          ("fps", 0), ("fps", None), ("chunks_size", 0), ("features", []))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
+
+
 # ---------------------------------------------------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("data_path", "../{chunk_index:03d}.parquet"),
-        ("data_path", "/etc/{chunk_index:03d}.parquet"),
-        ("data_path", "{chunk_index.__class__}.parquet"),
-        ("data_path", "{chunk_index:0999999999d}.parquet"),
-        ("data_path", "{other}.parquet"),
-        ("video_path", "{video_key:03d}"),
-        ("codebase_version", "v1.6"),
-        ("fps", 0),
-        ("fps", None),
-        ("chunks_size", 0),
-        ("features", []),
-    ],
-)
-def test_bad_info(tmp_path: Path, key: str, value: object) -> None:
-    write_lerobot(tmp_path, two_episodes(), depth=None)
-    edit(tmp_path, lambda info: info.update({key: value}))
-    with pytest.raises(FormatError, match=rf"info.json: {key}"):
-        data.open_all(tmp_path)
 
 
 def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

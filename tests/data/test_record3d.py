@@ -20,6 +20,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support import writers
 from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+from support.capture_cases import Case, check_case, check_frames
 from support.record3d_captures import DEPTH_HW, HW, camera_of, r3d_archive, rgbd_video, walk
 
 from dhtorch import data, pytree
@@ -36,49 +37,14 @@ OpenEXR = pytest.importorskip("OpenEXR")
 pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
-Y_UP = torch.tensor([1.0, -1.0, -1.0]).double()  # of a place in the box, as it is written
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], relative: float = 1e-6) -> None:
-    """K, pose and confidence as written, depth to the format's rounding, every point back on its wall."""
-    assert len(recording) == len(frames)
-    for got, want in zip(recording, frames, strict=True):
-        torch.testing.assert_close(got.camera.f, want.camera.f, atol=1e-5, rtol=0)
-        torch.testing.assert_close(got.camera.c, want.camera.c, atol=1e-5, rtol=0)
-        torch.testing.assert_close(got.depth, want.depth, atol=0, rtol=relative)
-        assert got.conf is None or torch.equal(got.conf, want.conf)
-        assert float((got.image.float() - want.image.float()).abs().mean()) < 6  # JPEG
-        assert float((got.time - (want.time - frames[0].time)).abs()) < 1e-9
-        T = turn_world(want, ARKIT_UP).T_world_from_cam
-        torch.testing.assert_close(got.T_world_from_cam.R, T.R, atol=1e-12, rtol=0)
-        torch.testing.assert_close(got.T_world_from_cam.t, T.t, atol=1e-12, rtol=0)
-        assert float(off_wall(world_points(own_camera(got))).max()) < 2 * relative + 1e-5
+    """Depth to the format's rounding, times from the first frame on; two frames agree with each other."""
+    check_frames(recording, frames, 8 * relative, up=ARKIT_UP)
+    times = [float(f.time - frames[0].time) for f in frames]
+    assert recording.times.tolist() == pytest.approx(times, abs=1e-9)
     assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
-
-
-def rewrite(archive: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
-    """The archive with its members changed."""
-    with zipfile.ZipFile(archive) as old:
-        members = {name: old.read(name) for name in old.namelist()}
-    change(members)
-    with zipfile.ZipFile(archive, "w") as new:
-        for name, content in members.items():
-            new.writestr(name, content)
-    return archive
-
-
-def table(**changes: Any) -> Callable[[dict[str, bytes]], None]:
-    """Entries of the metadata replaced; None removes one."""
-
-    def change(members: dict[str, bytes]) -> None:
-        name = "metadata"
-        meta = json.loads(members[name]) | changes
-        members[name] = json.dumps({k: v for k, v in meta.items() if v is not None}).encode()
-
-    return change
-
-
-# ------------------------------------------------------------------------------------------------ written, then read
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
@@ -127,111 +93,130 @@ def test_exr_channel(tmp_path: Path) -> None:
         data.open(tmp_path, exr_channel="far")[0]
 
 
-# -------------------------------------------------------------------------------------------------- traps of the table
+Change = Callable[[dict[str, bytes]], None]
 
 
-def test_frames_count_as_numbers(tmp_path: Path) -> None:
-    frames = walk(12)
-    recording = data.open(r3d_archive(tmp_path, frames))
-    assert recording.number.tolist() == list(range(12))  # "10" comes before "2" as a text
-    same_scene(recording, frames)
+def write_r3d(
+    root: Path,
+    frames: list[Frame],
+    *,
+    table: dict[str, Any] | None = None,
+    change: Change | None = None,
+    **options: Any,
+) -> None:
+    """An archive with entries of its metadata replaced (None removes one) and its members changed."""
+    file = root / "a.r3d"
+    writers.write_r3d(file, frames, **options)
+    with zipfile.ZipFile(file) as old:
+        members = {name: old.read(name) for name in old.namelist()}
+    meta = json.loads(members["metadata"]) | (table or {})
+    members["metadata"] = json.dumps({k: v for k, v in meta.items() if v is not None}).encode()
+    if change is not None:
+        change(members)
+    with zipfile.ZipFile(file, "w") as new:
+        for name, content in members.items():
+            new.writestr(name, content)
 
 
-def test_what_means_nothing_changes_nothing(tmp_path: Path) -> None:
-    """``initPose`` (its meaning is not known; readers pass over it), the icon, a sound track, notes of the system."""
+def r3d(name: str, n: int = 3, expect: Any = None, **more: Any) -> Case:
+    frames = more.pop("frames", lambda: walk(n))
+    options = {key: more.pop(key) for key in ("options", "error") if key in more}
+    write = more.pop("write", write_r3d)
+    return Case(name, write, frames, (), expect or {}, written=more, path="a.r3d", up=ARKIT_UP, **options)
+
+
+def meaningless(members: dict[str, bytes]) -> None:
+    members |= {"sound.m4a": b"1", "rgbd/.DS_Store": b"1", "rgbd/x.jpg": b"1", "__MACOSX/rgbd/._9.jpg": b"1"}
+
+
+def lead_out(members: dict[str, bytes]) -> None:
+    for part in ("jpg", "depth", "conf"):
+        members[f"../rgbd/9.{part}"] = members[f"/rgbd/9.{part}"] = members[f"rgbd/0.{part}"]
+
+
+def damage(members: dict[str, bytes]) -> None:
+    for name in ("1.depth", "2.conf", "3.jpg", "3.depth", "3.conf"):
+        del members[f"rgbd/{name}"]
+    members["rgbd/4.jpg"] = members["rgbd/4.jpg"][:-500]
+    members["rgbd/5.depth"] = members["rgbd/5.depth"][:-7]
+    members["rgbd/6.conf"] = b""
+
+
+def first_damaged(members: dict[str, bytes]) -> None:
+    members["rgbd/0.jpg"] = b"\xff\xd8 no picture \xff\xd9"
+
+
+def packed_depth(depth: np.ndarray, conf: int = 2, is_packed: bool = True) -> Change:
+    """A change of the first depth map, packed or not, and of its confidence."""
 
     def change(members: dict[str, bytes]) -> None:
-        table(initPose=[0.5, 0.5, 0.5, 0.5, 1, 2, 3])(members)
-        members |= {"sound.m4a": b"1", "rgbd/.DS_Store": b"1", "rgbd/x.jpg": b"1", "__MACOSX/rgbd/._9.jpg": b"1"}
+        members["rgbd/0.depth"] = lzfse.compress(depth.tobytes()) if is_packed else depth.tobytes()
+        members["rgbd/0.conf"] = lzfse.compress(bytes([conf]) * math.prod(DEPTH_HW))
 
-    same_scene(data.open(rewrite(r3d_archive(tmp_path), change)), walk())
-
-
-def test_K_is_stored_column_after_column(tmp_path: Path) -> None:
-    frames = walk(2)
-    archive = r3d_archive(tmp_path, frames, per_frame=False)
-    K = cameras.to_matrix(frames[0].camera)[0]
-    for frame in data.open(archive):
-        torch.testing.assert_close(cameras.to_matrix(frame.camera)[0], K)
-    rewrite(archive, table(K=K.flatten().tolist()))
-    with pytest.raises(FormatError, match=r"a.r3d/metadata: K: found .*, expected fx 0 0 0 fy 0 cx cy 1"):
-        data.open(archive)
+    return change
 
 
-def test_intrinsics_of_each_frame_or_of_the_first(tmp_path: Path) -> None:
-    archive = r3d_archive(tmp_path)
-    assert [float(f.camera.f[0, 0]) for f in data.open(archive)] == [61.5, 62.5, 63.5]
-    assert [float(f.camera.f[0, 0]) for f in data.open(archive, per_frame=False)] == [61.5] * 3
+def arkit_poses(n: int) -> list[list[float]]:
+    """The poses of the walk as the app writes them."""
+    rows = []
+    for frame in walk(n):
+        T = turn_world(frame, ARKIT_UP).T_world_from_cam
+        c2w = T.R[0].numpy() @ np.diag([1.0, -1.0, -1.0])
+        rows.append([*Rotation.from_matrix(c2w).as_quat(), *T.t[0].tolist()])
+    return rows
 
 
-def test_K_follows_the_true_size_of_the_picture(tmp_path: Path) -> None:
-    frames = walk(2)
-    archive = r3d_archive(tmp_path, frames, declared_hw=(96, 128))
-    with zipfile.ZipFile(archive) as packed:
-        meta = json.loads(packed.read("metadata"))
-    assert (meta["w"], meta["h"]) == (128, 96) and meta["K"][0] == 123
-    same_scene(data.open(archive), frames)
+LOST = arkit_poses(6)
+LOST[1], LOST[3] = [math.nan] * 7, [0.0] * 7
+FRONT = {"frames": lambda: [f.replace(conf=None, T_world_from_cam=None) for f in walk()]}
+HOLES = np.full(DEPTH_HW, 1.5, "<f4")
+HOLES[0, :5] = [np.nan, np.inf, -np.inf, -1, 0]
+ALL = {"same": ([0, 1, 2], 1e-5)}
+NO_CLOCK = {"frameTimestamps": [5.0, 4.0, 6.0]}
+F0, C0 = camera_of(0).f[0].tolist(), camera_of(0).c[0].tolist()
+K_ROWS = [F0[0], 0, C0[0], 0, F0[1], C0[1], 0, 0, 1]
 
 
-@pytest.mark.parametrize("size", [(256, 192), (640, 480), (960, 720)])
-@pytest.mark.parametrize("portrait", [False, True])
-def test_old_files_do_not_say_how_large_depth_is(tmp_path: Path, size: tuple[int, int], portrait: bool) -> None:
+def unsized(size: tuple[int, int], portrait: bool) -> Case:
+    """Old files do not state how large depth is."""
     hw, depth_hw = ((64, 48), size) if portrait else ((48, 64), size[::-1])
     depth = torch.linspace(0.5, 3, math.prod(size)).view(1, *depth_hw)
     frames = [f.replace(depth=depth, conf=None) for f in walk(1, hw, (8, 6) if portrait else (6, 8))]
-    assert torch.equal(data.open(r3d_archive(tmp_path, frames, depth_size=False))[0].depth, depth)
+    expect = {"depth hw": depth_hw, "median": pytest.approx(float(depth.median()))}
+    return r3d(f"depth of {size}, portrait {portrait}", 1, expect, frames=lambda: frames, depth_size=False)
 
 
-def test_unknown_depth_size(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"0.depth: depth: found 3072 bytes, expected dw and dh in the metadata"):
-        data.open(r3d_archive(tmp_path, depth_size=False))
-
-
-def test_front_camera_has_neither_confidence_nor_poses(tmp_path: Path) -> None:
-    frames = [f.replace(conf=None, T_world_from_cam=None) for f in walk()]
-    recording = data.open(r3d_archive(tmp_path, frames))
-    assert recording.poses is None and recording[1].T_world_from_cam is None and recording[1].conf is None
-    assert recording.report == ("every pose is the identity: no tracking",)
-    assert data.open(tmp_path / "a.r3d", poses=False).report == ()
-
-
-def test_a_standing_camera_keeps_its_poses(tmp_path: Path) -> None:
-    frames = [f.replace(T_world_from_cam=pose(1)) for f in walk()]
-    recording = data.open(r3d_archive(tmp_path, frames))
-    assert recording.poses is not None and recording.report == ()
-
-
-def test_lost_tracking_and_short_tables(tmp_path: Path) -> None:
-    archive = r3d_archive(tmp_path, walk(6))
-    with zipfile.ZipFile(archive) as packed:
-        meta = json.loads(packed.read("metadata"))
-    rows = meta["poses"]
-    rows[1], rows[3] = [math.nan] * 7, [0.0] * 7
-    rewrite(archive, table(poses=rows[:5]))
-    recording = data.open(archive)
-    assert recording.number.tolist() == [0, 2, 4]
-    torch.testing.assert_close(recording.poses.t[1], pose(2).t[0] * Y_UP)
-    assert recording.report == (
-        "frame 5: beyond the metadata's 5 rows: left out",
-        "2 frames (1, 3): its pose is not usable (tracking lost): left out",
-    )
-    assert data.open(archive, poses=False).number.tolist() == [0, 1, 2, 3, 4]
-
-
-def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
-    archive = rewrite(r3d_archive(tmp_path), table(frameTimestamps=[5.0, 4.0, 6.0]))
-    recording = data.open(archive)
-    torch.testing.assert_close(recording.times, torch.arange(3).double() / 60)
-    assert recording.report == ("time stamps do not increase: the frame rate is used instead",)
-    recording = data.open(rewrite(archive, table(fps=None)))
-    assert recording.times is None and recording.report == ("time stamps do not increase: there are no times",)
-    recording = data.open(rewrite(archive, table(frameTimestamps=[7.0, 7.5, 9.0])))
-    assert recording.times.tolist() == [0, 0.5, 2] and recording.report == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+CASES = [
+    r3d("frames count as numbers", 12, {"number": list(range(12)), "same": (list(range(12)), 1e-5)}),
+    r3d("what means nothing", 3, ALL | {"report": ()}, table={"initPose": [0.5, 0.5, 0.5, 0.5, 1, 2, 3]},
+        change=meaningless),
+    r3d("K by columns", 2, {"all f": [F0[0]] * 2, "c": C0}, per_frame=False),
+    r3d("K by rows", 2, per_frame=False, table={"K": K_ROWS},
+        error=r"a.r3d/metadata: K: found .*, expected fx 0 0 0 fy 0 cx cy 1"),
+    r3d("intrinsics of each frame", 3, {"all f": [61.5, 62.5, 63.5]}),
+    r3d("intrinsics of the first", 3, {"all f": [61.5] * 3}, options={"per_frame": False}),
+    r3d("K of another size", 2, {"same": ([0, 1], 1e-5)}, declared_hw=(96, 128)),
+    *(unsized(size, portrait) for size in ((256, 192), (640, 480), (960, 720)) for portrait in (False, True)),
+    r3d("unknown size", 3, depth_size=False,
+        error=r"0.depth: depth: found 3072 bytes, expected dw and dh in the metadata"),
+    r3d("the front camera", 3, {"posed": False, "conf": False,
+                                "report": ("every pose is the identity: no tracking",)}, **FRONT),
+    r3d("the front camera, no poses wanted", 3, {"posed": False, "report": ()}, options={"poses": False}, **FRONT),
+    r3d("a standing camera", 3, {"posed": True, "report": ()},
+        frames=lambda: [f.replace(T_world_from_cam=pose(1)) for f in walk()]),
+    r3d("lost tracking and short tables", 6,
+        {"number": [0, 2, 4], "same": ([0, 2, 4], 1e-5), "report": (
+            "frame 5: beyond the metadata's 5 rows: left out",
+            "2 frames (1, 3): its pose is not usable (tracking lost): left out")}, table={"poses": LOST[:5]}),
+    r3d("lost tracking, no poses wanted", 6, {"number": [0, 1, 2, 3, 4]}, table={"poses": LOST[:5]},
+        options={"poses": False}),
+    r3d("stamps that do not increase", 3,
+        {"times": pytest.approx([0, 1 / 60, 2 / 60]),
+         "report": ("time stamps do not increase: the frame rate is used instead",)}, table=NO_CLOCK),
+    r3d("stamps that do not increase, no rate", 3,
+        {"times": None, "report": ("time stamps do not increase: there are no times",)}, table=NO_CLOCK | {"fps": None}),
+    r3d("stamps", 3, {"times": [0, 0.5, 2], "report": ()}, table={"frameTimestamps": [7.0, 7.5, 9.0]}),
+    *(r3d(f"table {message}", 3, table=table, error=message) for table, message in (
         ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the images"),
         ({"w": 1e9}, r"metadata: w: found 1000000000.0"),
         ({"dw": 0.5}, r"metadata: dw, dh: found 0.5x24, expected whole numbers"),
@@ -240,38 +225,24 @@ def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
         ({"perFrameIntrinsicCoeffs": [[math.nan] * 4] * 3}, r"perFrameIntrinsicCoeffs: found a number that is not"),
         ({"perFrameIntrinsicCoeffs": [[-1, 1, 1, 1]] * 3}, r"intrinsics of frame 0 focal length: found"),
         ({"perFrameIntrinsicCoeffs": None, "K": [1, 2]}, r"metadata: K: found \[1.0, 2.0\], expected 9 finite"),
-        ({"poses": [[0, 0, 0, 1, 1e30, 0, 0]] * 3}, r"metadata: pose 0: found .*, expected at most 4e\+07 m"),
-    ],
-)
-def test_unsound_tables(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    archive = rewrite(r3d_archive(tmp_path), table(**change))
-    with pytest.raises(FormatError, match=message):
-        list(data.open(archive))
+        ({"poses": [[0, 0, 0, 1, 1e30, 0, 0]] * 3}, r"metadata: pose 0: found .*, expected at most 4e\+07 m"))),
+    r3d("missing and damaged", 8,
+        {"number": [0, 7], "same": ([0, 7], 1e-5), "report": (
+            "frame 1: no depth: left out", "frame 2: no confidence: left out", "frame 3: no file: left out",
+            "3 frames (4, 5, 6): damaged: left out")}, change=damage),
+    r3d("the first damaged", 3, {"number": [1, 2]}, change=first_damaged, options={"verify": True}),
+    *(r3d(f"holes, packed {is_packed}", 1, {"median": 1.5, "returns": DEPTH_HW[0] * DEPTH_HW[1] - 5},
+          change=packed_depth(HOLES, is_packed=is_packed)) for is_packed in (True, False)),
+    r3d("levels above 2", 1, change=packed_depth(HOLES, conf=3),
+        error=r"0.conf: confidence: found 3, expected 0, 1 or 2"),
+    r3d("names that lead out", 3, ALL | {"number": [0, 1, 2]}, change=lead_out),
+]  # fmt: skip
 
 
-# ----------------------------------------------------------------------------------------------- damage in the middle
-
-
-def test_what_is_missing_or_damaged_is_left_out_and_reported(tmp_path: Path) -> None:
-    def damage(members: dict[str, bytes]) -> None:
-        del members["rgbd/1.depth"], members["rgbd/2.conf"]
-        for part in ("jpg", "depth", "conf"):
-            del members[f"rgbd/3.{part}"]
-        members["rgbd/4.jpg"] = members["rgbd/4.jpg"][:-500]
-        members["rgbd/5.depth"] = members["rgbd/5.depth"][:-7]
-        members["rgbd/6.conf"] = b""
-
-    archive = rewrite(r3d_archive(tmp_path, walk(8)), damage)
-    recording = data.open(archive)
-    assert recording.number.tolist() == [0, 7]
-    assert recording.report == (
-        "frame 1: no depth: left out",
-        "frame 2: no confidence: left out",
-        "frame 3: no file: left out",
-        "3 frames (4, 5, 6): damaged: left out",
-    )
-    torch.testing.assert_close(recording.poses.t[1], pose(7).t[0] * Y_UP)
-    torch.testing.assert_close(recording[1].camera.f, camera_of(7).f)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
+    assert {file.name for file in tmp_path.rglob("*")} == {"capture", "a.r3d"}
 
 
 def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> None:
@@ -289,49 +260,11 @@ def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> No
     assert verified.number.tolist() == [0, 1, 3] and verified.report == ("frame 2: damaged: left out",)
 
 
-def test_the_first_frame_damaged(tmp_path: Path) -> None:
-    archive = rewrite(
-        r3d_archive(tmp_path), lambda members: members.update({"rgbd/0.jpg": b"\xff\xd8 no picture \xff\xd9"})
-    )
-    assert data.open(archive, verify=True).number.tolist() == [1, 2]
-
-
-def test_depth_without_a_return(tmp_path: Path) -> None:
-    def odd(members: dict[str, bytes]) -> None:
-        depth = np.full(DEPTH_HW, 1.5, "<f4")
-        depth[0, :5] = [np.nan, np.inf, -np.inf, -1, 0]
-        members["rgbd/0.depth"] = lzfse.compress(depth.tobytes())
-        members["rgbd/1.depth"] = depth.tobytes()  # not compressed at all
-        members["rgbd/2.conf"] = lzfse.compress(bytes([3]) * math.prod(DEPTH_HW))
-
-    recording = data.open(rewrite(r3d_archive(tmp_path), odd))
-    for i in (0, 1):
-        depth = recording[i].depth[0]
-        assert depth[0, :5].tolist() == [0] * 5 and bool((depth.flatten()[5:] == 1.5).all())
-    with pytest.raises(FormatError, match=r"2.conf: confidence: found 3, expected 0, 1 or 2"):
-        recording[2]
-
-
-def test_names_that_lead_out_of_the_archive_are_not_frames(tmp_path: Path) -> None:
-    (tmp_path / "secret.jpg").write_bytes(b"secret")
-
-    def lead_out(members: dict[str, bytes]) -> None:
-        for part in ("jpg", "depth", "conf"):
-            members[f"../rgbd/9.{part}"] = members[f"/rgbd/9.{part}"] = members[f"rgbd/0.{part}"]
-
-    archive = rewrite(r3d_archive(tmp_path), lead_out)
-    assert data.open(archive).number.tolist() == [0, 1, 2]
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.r3d", "secret.jpg"]
-
-
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = r3d_archive(tmp_path, walk(5))
     monkeypatch.setattr(files, "decode_image", lambda *_: pytest.fail("decoded a picture"))
     monkeypatch.setattr("dhtorch.data.codecs.lzfse.decompress_lzfse", lambda *_: pytest.fail("unpacked depth"))
     assert len(data.open(archive)) == 5
-
-
-# --------------------------------------------------------------------------------------------------------- RGBD mp4
 
 
 @pytest.mark.parametrize("depth_range", [None, (0.0, 4.5), (0.15, 2.9)])
@@ -395,9 +328,6 @@ def test_mp4_intrinsics_beside_it_or_nowhere(tmp_path: Path) -> None:
     assert float(data.open(file, depth_range=(0, 6))[0].depth.max()) > 3
     with pytest.raises(FormatError, match=r"rangeOfEncodedDepth: found 2.0 to 1.0 m"):
         data.open(file, depth_range=(2, 1))
-
-
-# ------------------------------------------------------------------------------------------------------------- live
 
 
 class Phone:
@@ -518,9 +448,6 @@ def test_live_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "record3d", None)
     with pytest.raises(ImportError, match=r"needs record3d.*pip install 'dhtorch\[live\]'"):
         LiveFrames()
-
-
-# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data

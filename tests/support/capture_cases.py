@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pyarrow import parquet
 
 from dhtorch import data
 from dhtorch.data.recording import Recording
@@ -29,7 +30,7 @@ def edit_files(root: Path, edits: Sequence[Edit]) -> None:
     """Edit files in turn; a name is a path below ``root`` or a pattern of existing ones.
 
     The change is DELETE; the new content (text, bytes, codes or an image as array); another name (a ``Path``); pairs
-    (old text, new text); entries that are put into a JSON document, at any depth; or a function of the text.
+    (old text, new text); entries that are put into a JSON document, at any depth; or a function of the text (of the table, for Parquet).
     """
     for name, change in edits:
         for file in sorted(root.glob(name)) or [root / name]:
@@ -44,6 +45,8 @@ def edit_files(root: Path, edits: Sequence[Edit]) -> None:
                 parts.save_file(file, parts.encode_unfiltered_png(change))
             elif isinstance(change, Mapping):
                 file.write_text(json.dumps(merge(json.loads(file.read_text()), change)))
+            elif callable(change) and file.suffix == ".parquet":
+                parquet.write_table(change(parquet.read_table(file)), file, row_group_size=3)
             elif callable(change):
                 file.write_text(change(file.read_text()))
             else:
@@ -108,6 +111,7 @@ FACTS: Mapping[str, Callable[[Recording], Any]] = {
     "conf": lambda r: r[0].conf is not None,
     "truth": lambda r: hasattr(r, "truth"),
     "hw": lambda r: r[0].hw,
+    "returns": lambda r: int((r[0].depth > 0).sum()),
     "empty": lambda r: [not f.depth.any() for f in r],
 }
 

@@ -60,13 +60,15 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
     if model is None:
         command = "colmap model_converter --input_path sparse/0 --output_path sparse/0 --output_type TXT"
         raise FormatError(root, "model", "no text model", f"cameras.txt and images.txt (of a binary one: {command})")
-    pictures = _find_folder(root, _IMAGE_FOLDERS) if images is None else _join(root, images)
+    pictures = _find_folder(root, _IMAGE_FOLDERS) if images is None else Path(os.path.normpath(root / images))
     if pictures is None or not pictures.is_dir():
         problem = "none beside the model" if images is None else f"no folder {images}"
         raise FormatError(root, "images", problem, "images/, or data.images=FOLDER and data.depth=FOLDER")
-    maps = root / "depth" if depth is None else _join(root, depth)
+    maps = root / "depth" if depth is None else Path(os.path.normpath(root / depth))
     lenses = read_colmap_cameras(model / "cameras.txt")
-    times = _read_times(model / "times.txt")
+    times, file = {}, model / "times.txt"  # dhtorch integrate writes the times of the images
+    for line, words in files.read_rows(file) if file.is_file() else ():
+        times[parse_id(words[0], file, line)] = parse_numbers(words[1:], 1, file, line)[0]
     rows, missing = [], []
     for entry in read_colmap_images(model / "images.txt", observations=False):
         image = files.resolve_inside(pictures, entry.name, model / "images.txt", f"image {entry.image_id}")
@@ -76,10 +78,11 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
         if entry.camera_id not in lenses:
             raise FormatError(model / "images.txt", f"camera of image {entry.image_id}", entry.camera_id, "a camera")
         lens = lenses[entry.camera_id]
+        candidates = (maps / f"{stem}{suffix}" for stem in (image.stem, image.name) for suffix in _DEPTH_SUFFIXES)
         rows.append(
             PosedImage(
                 image=image,
-                depth=_find_depth(maps, image),
+                depth=next((each for each in candidates if each.is_file()), None),
                 K=lens.K,
                 source=model / "cameras.txt",
                 c2w=entry.c2w,
@@ -89,7 +92,8 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
             )
         )
     report = format_names_left_out(missing, "no such image")
-    if not _is_metric(model / "images.txt"):
+    head = files.read_lines(model / "images.txt")[:10]
+    if not any(text.startswith("#") and "metres" in text for text in head):
         report.append("poses were estimated by COLMAP: their scale is not metric unless it was aligned")
     return [open_posed_images(root, "colmap", rows, unit=None, report=report)]
 
@@ -101,29 +105,3 @@ def _find_model(root: Path) -> Path | None:
 
 def _find_folder(root: Path, names: tuple[str, ...]) -> Path | None:
     return next((root / name for name in names if (root / name).is_dir()), None)
-
-
-def _join(root: Path, option: str) -> Path:
-    """Folder of an option, which may lie outside the capture."""
-    return Path(os.path.normpath(root / option))
-
-
-def _find_depth(folder: Path, image: Path) -> Path | None:
-    candidates = (folder / f"{stem}{suffix}" for stem in (image.stem, image.name) for suffix in _DEPTH_SUFFIXES)
-    return next((file for file in candidates if file.is_file()), None)
-
-
-def _read_times(file: Path) -> dict[int, float]:
-    """Image id → time in s, from the file that ``dhtorch integrate`` writes; empty where there is none."""
-    if not file.is_file():
-        return {}
-    return {
-        parse_id(words[0], file, line): parse_numbers(words[1:], 1, file, line)[0]
-        for line, words in files.read_rows(file)
-    }
-
-
-def _is_metric(file: Path) -> bool:
-    """Whether a comment states that the poses are in metres."""
-    head = files.read_lines(file)[:10]
-    return any(text.startswith("#") and "metres" in text for text in head)

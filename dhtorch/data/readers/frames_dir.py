@@ -33,6 +33,7 @@ from dhtorch.data.readers.image_table import (
     ImageRow,
     ImageTableLoader,
     list_images,
+    parse_option,
     read_depth_hw,
     read_K,
     read_pose,
@@ -120,30 +121,30 @@ def read(
     frames, poses, report = _list_frames(root)
     hw = files.read_image_header(frames[0].image).hw
     depth_hw = read_depth_hw(frames[0].depth)
-    stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    if stated.feature is not None:
-        raise FormatError(
-            root, "option intrinsics", stated.feature, "fx fy cx cy, or degrees (the format has no features)"
-        )
+    stated = parse_option(root, hw, intrinsics, K, fov)
     colour_K = _read_intrinsics(root, "K", stated.K, meta)
     if colour_K is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, "a file K.txt, intrinsics.txt or meta.json")
-    colour = convert.to_camera(
-        colour_K[0], hw, *colour_K[1:], distortion if distortion is not None else meta.get("dist")
-    )
+    lens = distortion if distortion is not None else meta.get("dist")
+    colour = convert.to_camera(colour_K[0], hw, *colour_K[1:], lens)
     # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
-    other_K = _compare_with_file(root, colour_K, depth_K)
+    other_K = _compare_with_file(root, colour_K, depth_K)  # read in any case: a file beside an option is not unread
     report += other_K if stated.K is None else []
     units, unit = _parse_unit(units_per_metre, meta, side_car)
-    rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
+    value = fps if fps is not None else meta.get("fps")
+    rate = None if value is None or isinstance(value, str) else files.to_positive(value, side_car, "fps")
+    no_return = invalid if invalid is not None else meta.get("invalid", NO_DEPTH_CODES)
+    if not isinstance(no_return, Sequence) or not all(isinstance(code, int) for code in no_return):
+        raise FormatError(side_car, "invalid", no_return, "a list of depth codes")
     number = torch.tensor([frame.number for frame in frames])
     times = None if rate is None else number.double() / rate
     if fps is None and "times" in meta:
         times = torch.from_numpy(files.to_array(meta["times"], (len(frames),), side_car, "times"))
     if K is None and "K_frames" in meta:
-        lens = distortion if distortion is not None else meta.get("dist")
-        frames = _set_cameras(frames, meta["K_frames"], hw, side_car, lens)
+        rows = files.to_array(meta["K_frames"], (len(frames), 4), side_car, "K_frames")
+        cameras = [convert.to_camera(convert.make_K(*row), hw, side_car, "K_frames", lens) for row in rows]
+        frames = [replace(frame, camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
     load = ImageTableLoader(
         rows=tuple(frames),
         hw=hw,
@@ -151,7 +152,7 @@ def read(
         camera=colour,
         depth_camera=convert.to_camera(depth_K[0], depth_hw, *depth_K[1:]) if depth_K else None,
         units_per_metre=units,
-        no_return=_parse_codes(invalid if invalid is not None else meta.get("invalid", NO_DEPTH_CODES), side_car),
+        no_return=tuple(no_return),
         rotated_bits=rotated_bits,
         register=register,
     )
@@ -170,17 +171,6 @@ def read(
             depth_unit=unit,
             stored=stored,
         )
-    ]
-
-
-def _set_cameras(
-    frames: Sequence[ImageRow], values: object, hw: tuple[int, int], side_car: Path, distortion: object
-) -> list[ImageRow]:
-    """Frames with the cameras (fx fy cx cy, one row for each) that ``K_frames`` of the side-car states."""
-    rows = files.to_array(values, (len(frames), 4), side_car, "K_frames")
-    return [
-        replace(frame, camera=convert.to_camera(convert.make_K(*row), hw, side_car, "K_frames", distortion))
-        for frame, row in zip(frames, rows, strict=True)
     ]
 
 
@@ -224,10 +214,16 @@ def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
         increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
         numbers = values if increasing else range(len(stems))
         frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
-        source = file or _find_pose_folder(root, stems)
+        folders = [root / name for name in _POSE_FOLDERS]
+        has_file = (each for each in folders if any((each / f"{stem}.txt").is_file() for stem in stems))
+        source = file or next(has_file, None)
         if source is None:
             return frames, None, ["no poses.txt: no poses"]
-        poses = _read_pose_files(source, stems) if rows is None else _parse_poses(rows, source)
+        if rows is None:  # a file for each image, by its name
+            places = [source / f"{stem}.txt" for stem in stems]
+            poses = [read_pose(place) if place.is_file() else None for place in places]
+        else:
+            poses = _parse_poses(rows, source)
         frames, report = split_lost([replace(frame, c2w=pose) for frame, pose in zip(frames, poses, strict=True)])
         c2w = [frame.c2w for frame in frames if frame.c2w is not None]
         return frames, convert.to_poses(np.stack(c2w), source) if c2w else None, report
@@ -267,18 +263,6 @@ def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[st
         for frame, matrix in zip(frames, poses, strict=True):
             convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
         raise
-
-
-def _find_pose_folder(root: Path, stems: Sequence[str]) -> Path | None:
-    """The folder with a pose file named as an image; None where there is none."""
-    folders = [root / name for name in _POSE_FOLDERS]
-    return next((folder for folder in folders if any((folder / f"{stem}.txt").is_file() for stem in stems)), None)
-
-
-def _read_pose_files(folder: Path, stems: Sequence[str]) -> list[np.ndarray | None]:
-    """Camera-to-world (4, 4) of each image from the file of its name; None where there is none."""
-    places = [folder / f"{stem}.txt" for stem in stems]
-    return [read_pose(place) if place.is_file() else None for place in places]
 
 
 def _parse_poses(rows: np.ndarray, file: Path) -> list[np.ndarray | None]:
@@ -330,14 +314,3 @@ def _parse_unit(option: float | None, meta: dict[str, object], side_car: Path) -
     # No camera stores less than one code per metre: such a number is metres of one code, as RealSense's.
     units = scale if scale >= 1 else 1 / scale
     return units, DepthUnit(1 / units, source)
-
-
-def _parse_rate(value: object, file: Path) -> float | None:
-    """Frame rate in Hz; None where it is missing or a text."""
-    return None if value is None or isinstance(value, str) else files.to_positive(value, file, "fps")
-
-
-def _parse_codes(value: object, file: Path) -> tuple[int, ...]:
-    if not isinstance(value, Sequence) or not all(isinstance(code, int) for code in value):
-        raise FormatError(file, "invalid", value, "a list of depth codes")
-    return tuple(value)

@@ -47,12 +47,13 @@ from dhtorch.data.readers.lerobot_meta import (
 )
 from dhtorch.data.readers.lerobot_rows import (
     find_capture_columns,
+    find_row_stamps,
+    pair_episode_videos,
     read_capture_clock,
     read_encoded_image,
     read_row_table,
     select_episode_rows,
 )
-from dhtorch.data.readers.lerobot_video import find_row_stamps, pair_episode_videos
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.records import Camera, Frame

@@ -105,7 +105,11 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
         ]
     if not rows:
         raise FormatError(file, "frames", "; ".join(report) or "none", "at least one image")
-    unit, name = _parse_unit(meta, file), folder.resolve().name
+    stating = next((name for name in _UNIT_KEYS if meta.get(name) is not None), None)
+    unit = None
+    if stating is not None:
+        unit = DepthUnit(files.to_positive(meta[stating], file, stating), f"{file.name}: {stating}")
+    name = folder.resolve().name
     return [
         open_posed_images(
             root,
@@ -178,7 +182,11 @@ def parse_lens(
     lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
     if k4 := _number(values, "k4", file, k, 0.0):
         raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
-    hw = _parse_size(values, image, file, k)
+    hw = None
+    if "w" in values and "h" in values:  # the size that K refers to
+        h, w = (files.to_positive(values[name], file, f"frames.{k}.{name}") for name in "hw")
+        hw = round(h), round(w)
+    hw = hw or files.read_image_header(image).hw
     # K with pixel centres at integers, from focal lengths or Instant-NGP's angles
     focal = {axis: _parse_focal(values, axis, size, file, k) for axis, size in (("x", hw[1]), ("y", hw[0]))}
     fx = focal["x"] if focal["x"] is not None else focal["y"]
@@ -187,14 +195,6 @@ def parse_lens(
     fy = fx if focal["y"] is None else focal["y"]
     cx, cy = (_number(values, f"c{axis}", file, k, n / 2) for axis, n in (("x", hw[1]), ("y", hw[0])))
     return convert.make_K(fx, fy, cx - 0.5, cy - 0.5), hw, lens if any(lens) else None
-
-
-def _parse_size(values: Mapping[str, Any], image: Path, file: Path, k: int) -> tuple[int, int]:
-    """(height, width) that K refers to: stated, else of the image."""
-    if "w" not in values or "h" not in values:
-        return files.read_image_header(image).hw
-    h, w = (files.to_positive(values[name], file, f"frames.{k}.{name}") for name in "hw")
-    return round(h), round(w)
 
 
 def _parse_focal(values: Mapping[str, Any], axis: str, size: int, file: Path, k: int) -> float | None:
@@ -247,14 +247,6 @@ def _parse_applied(meta: Mapping[str, Any], file: Path) -> tuple[np.ndarray, lis
     if scale != 1:
         report.append(f"poses are stored times {scale:.6g} (applied_scale): undone")
     return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ applied), report
-
-
-def _parse_unit(meta: Mapping[str, Any], file: Path) -> DepthUnit | None:
-    """Unit of the depth maps; None = not stated."""
-    for name in _UNIT_KEYS:
-        if meta.get(name) is not None:
-            return DepthUnit(files.to_positive(meta[name], file, name), f"{file.name}: {name}")
-    return None
 
 
 def _number(values: Mapping[str, Any], name: str, file: Path, k: int, default: float) -> float:

@@ -77,15 +77,12 @@ class PosedImageLoader:
             levels = self.level_of_code(files.read_image(row.conf, self.depth_hw)[0])
             conf = torch.from_numpy(np.ascontiguousarray(levels, np.uint8))[None]
         image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
-        return Frame(image[None], self._depth(row)[None], camera, conf=conf)
-
-    def _depth(self, row: PosedImage) -> Tensor:
-        if row.depth is None:
-            return torch.zeros(self.depth_hw)
-        depth = read_depth_steps(row.depth, self.depth_hw) * self.step_m
-        if row.origin is not None:
+        depth = (
+            np.zeros(self.depth_hw) if row.depth is None else read_depth_steps(row.depth, self.depth_hw) * self.step_m
+        )
+        if row.depth is not None and row.origin is not None:
             depth[files.read_image(row.origin, self.depth_hw)[0] != Source.SENSOR] = 0
-        return torch.from_numpy(depth.astype(np.float32))
+        return Frame(image[None], torch.from_numpy(depth.astype(np.float32))[None], camera, conf=conf)
 
 
 def open_posed_images(
@@ -141,7 +138,7 @@ def open_posed_images(
         name=name or root.resolve().name,
         format=format,
         load=PosedImageLoader(tuple(rows), hw, first[0], step_m, header.orientation, level_of_code),
-        number=_parse_numbers(rows),
+        number=torch.tensor([row.number for row in rows] if rows[0].number >= 0 else list(range(len(rows)))),
         root=root,
         times=times,
         poses=poses,
@@ -154,7 +151,11 @@ def open_posed_images(
 
 def sort_posed_images(rows: Sequence[PosedImage]) -> list[PosedImage]:
     """Rows in the order of their numbers, else of the numbers in their names, else of time, else of their names."""
-    counted = [row if row.number >= 0 else replace(row, number=_count_in_name(row.image)) for row in rows]
+    counted = []
+    for row in rows:
+        match = re.search(r"(\d+)\D*$", row.image.stem)  # the last number in the name, if it can count frames
+        number = int(match[1]) if match and len(match[1]) <= _MAX_COUNTER_DIGITS else -1
+        counted.append(row if row.number >= 0 else replace(row, number=number))
     numbers = [row.number for row in counted]
     if min(numbers, default=0) >= 0 and len(set(numbers)) == len(numbers):
         return sorted(counted, key=lambda row: row.number)
@@ -209,12 +210,6 @@ def _read_array(file: Path) -> np.ndarray:
     return values
 
 
-def _count_in_name(file: Path) -> int:
-    """The last number in a file's name, if it can count frames; else −1."""
-    match = re.search(r"(\d+)\D*$", file.stem)
-    return int(match[1]) if match and len(match[1]) <= _MAX_COUNTER_DIGITS else -1
-
-
 def _select_complete(rows: Sequence[PosedImage]) -> tuple[list[PosedImage], list[str]]:
     """Rows with an image, and with a finite pose where any row has one; report of the others by name."""
     present = [row for row in rows if row.image.is_file()]
@@ -254,12 +249,6 @@ def _fit_cameras(rows: Sequence[PosedImage], hw: tuple[int, int], exif: int) -> 
         report |= dict.fromkeys(lines)
         fitted.append(replace(row, K=K, hw=hw))
     return fitted, list(report)
-
-
-def _parse_numbers(rows: Sequence[PosedImage]) -> Tensor:
-    numbers = [row.number for row in rows]
-    is_numbered = min(numbers) >= 0
-    return torch.tensor(numbers if is_numbered else list(range(len(rows))))
 
 
 def _parse_times(rows: Sequence[PosedImage]) -> tuple[Tensor | None, list[str]]:

@@ -51,7 +51,7 @@ def recognise(root: Path) -> str | None:
         if root.suffix.lower() == ".r3d":
             return ".r3d archive"
         return record3d_video.recognise(root)
-    inner = _find_export_folder(root)
+    inner = root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
     if (inner / "metadata.json").is_file() and (inner / "rgb").is_dir() and any((inner / "depth").glob("*.exr")):
         return "metadata.json, rgb/ and depth/*.exr"
     if (root / "metadata").is_file() and any((root / "rgbd").glob("*.depth")):
@@ -98,7 +98,7 @@ def read(
     if root.is_file():
         members, inner, name = list_zip_members(root), root, root.stem
     elif root.is_dir():
-        inner, name = _find_export_folder(root), root.resolve().name
+        inner, name = root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root, root.resolve().name
         members = list_folder_members(inner)
     else:
         raise FormatError(root, "path", "no such file or folder", "a Record3D capture")
@@ -200,11 +200,6 @@ class _Load:
         if conf.max() > 2:
             raise FormatError(part.path, "confidence", int(conf.max()), "0, 1 or 2")
         return conf.reshape(h, w).copy()
-
-
-def _find_export_folder(root: Path) -> Path:
-    """The folder of the EXR export: ``root/EXR_RGBD`` where it exists, else ``root``."""
-    return root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
 
 
 # --------------------------------------------------------------------------------------------------------- metadata

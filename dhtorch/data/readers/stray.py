@@ -26,7 +26,7 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data.clocks import FilmPairing, format_numbers, pair_film
 from dhtorch.data.codecs import pickles
-from dhtorch.data.codecs.video import VideoHeader, read_video_frame, read_video_header, read_video_times
+from dhtorch.data.codecs.video import read_video_frame, read_video_header, read_video_times
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.orientation import orientation_scores
@@ -98,18 +98,33 @@ def read(
     if video is not None and not video.is_file():
         raise FormatError(video, "file", "no such file", "the images (data.images=false reads depth only)")
     header = None if video is None else read_video_header(video, all_frames=True)
-    hw = header.hw if header is not None else _parse_size(K_hw, root) or _DEFAULT_HW
+    stated_hw = None
+    if K_hw is not None:
+        sides = files.to_array(K_hw, (2,), root, "option K_hw")
+        stated_hw = (
+            int(files.to_positive(sides[0], root, "option K_hw")),
+            int(files.to_positive(sides[1], root, "option K_hw")),
+        )
+    hw = header.hw if header is not None else stated_hw or _DEFAULT_HW
     shots, missing = _list_shots(root, rows, poses)
     report += missing
     if (root / "distortion").is_dir():
         report.append("distortion/ has lens tables of each frame: they are not applied")
     if not shots:
         raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
-    load = _Load(root, tuple(shots), video, hw, _read_intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
+    table = root / "camera_matrix.csv"
+    lines = [line.replace(",", " ").split() for line in files.read_lines(table) if line.strip()]
+    K = files.to_array(lines, (3, 3), table, "K")
+    load = _Load(root, tuple(shots), video, hw, K, stated_hw or hw, per_frame, _depth_hw(shots))
     if video is not None:
         load, remarks = _match_pictures(load, rows, lost_first)
         report += remarks
-    used = load.shots
+    stored, used = None, load.shots
+    if header is not None:
+        # The app leaves the display matrix and stores film and depth as the sensor sees, so that the matrix counts only
+        # where their sizes contradict this.
+        display = header.display if describe_mismatch(load.depth_hw, header.hw) else 0
+        stored = StoredSizes(header.hw, load.depth_hw, display, "display matrix of rgb.mp4")
     times = torch.tensor([shot.row.time for shot in used], dtype=torch.float64)
     increasing = bool((times.diff() > 0).all())
     c2w = np.stack([shot.row.c2w for shot in used]) if poses else None
@@ -125,7 +140,7 @@ def read(
             rate_hz=float(1 / times.diff().median()) if increasing and len(used) > 1 else None,
             report=tuple(report + ([] if increasing else ["time stamps do not increase: there are no times"])),
             depth_unit=_DEPTH_UNIT,
-            stored=None if header is None else _stored_sizes(header, load.depth_hw),
+            stored=stored,
         )
     ]
 
@@ -151,20 +166,6 @@ class _Shot:
     picture: int = -1  # index in the video
 
 
-@dataclass(frozen=True)
-class _Intrinsics:
-    """K for images of one size, per row or for all."""
-
-    file: Path
-    K: np.ndarray  # (3, 3)
-    hw: tuple[int, int]  # of the images that K refers to
-    per_frame: bool
-
-    def of(self, row: _Row, hw: tuple[int, int]) -> np.ndarray:
-        K = convert.make_K(*row.K) if self.per_frame and row.K is not None else self.K
-        return convert.resize_K(K, self.hw, hw)
-
-
 @dataclass(frozen=True, eq=False)
 class _Load:
     """Position → frame."""
@@ -173,13 +174,16 @@ class _Load:
     shots: tuple[_Shot, ...]
     video: Path | None
     hw: tuple[int, int]
-    intrinsics: _Intrinsics
+    K: np.ndarray  # (3, 3) of all frames that have none of their own
+    K_hw: tuple[int, int]  # of the images that K refers to
+    per_frame: bool
     depth_hw: tuple[int, int]
 
     def __call__(self, i: int) -> Frame:
         shot = self.shots[i]
-        K = self.intrinsics.of(shot.row, self.hw)
-        camera = convert.to_camera(K, self.hw, self.intrinsics.file, f"intrinsics of frame {shot.row.number}")
+        own = convert.make_K(*shot.row.K) if self.per_frame and shot.row.K is not None else self.K
+        K, file = convert.resize_K(own, self.K_hw, self.hw), self.root / "camera_matrix.csv"
+        camera = convert.to_camera(K, self.hw, file, f"intrinsics of frame {shot.row.number}")
         image = np.zeros((3, 0, 0), np.uint8) if self.video is None else self.picture(shot.picture).transpose(2, 0, 1)
         return Frame(
             image=torch.from_numpy(np.ascontiguousarray(image))[None],
@@ -209,13 +213,6 @@ class _Load:
         if conf.max() > 2:
             raise FormatError(file, "confidence", int(conf.max()), "0, 1 or 2")
         return np.ascontiguousarray(conf)
-
-
-def _stored_sizes(header: VideoHeader, depth_hw: tuple[int, int]) -> StoredSizes:
-    """Sizes of film and depth. The app leaves the display matrix and stores both as the sensor sees, so that the matrix
-    counts only where their sizes contradict this."""
-    display = header.display if describe_mismatch(depth_hw, header.hw) else 0
-    return StoredSizes(header.hw, depth_hw, display, "display matrix of rgb.mp4")
 
 
 # ------------------------------------------------------------------------------------------------------------- tables
@@ -267,19 +264,6 @@ def _parse_number(cell: str, file: Path, field: str) -> float:
         return float(cell) if cell else float("nan")
     except ValueError:
         raise FormatError(file, field, cell, "a number") from None
-
-
-def _read_intrinsics(root: Path, hw: tuple[int, int], K_hw: Sequence[int] | None, per_frame: bool) -> _Intrinsics:
-    file = root / "camera_matrix.csv"
-    lines = [line.replace(",", " ").split() for line in files.read_lines(file) if line.strip()]
-    return _Intrinsics(file, files.to_array(lines, (3, 3), file, "K"), _parse_size(K_hw, root) or hw, per_frame)
-
-
-def _parse_size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    h, w = files.to_array(value, (2,), root, "option K_hw")
-    return int(files.to_positive(h, root, "option K_hw")), int(files.to_positive(w, root, "option K_hw"))
 
 
 # ------------------------------------------------------------------------------------------------------------- frames

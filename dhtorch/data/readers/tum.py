@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,9 +129,10 @@ def read(
     times = np.array([colour[i][0] for i, _ in pairs])
     report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference, is_numbered)
     hw = files.read_image_header(colour[pairs[0][0]][1]).hw
-    source = _find_camera(root, intrinsics, camera, hw, K, fov)
-    unit = _find_unit(root, units_per_metre, source)
-    trajectory = _find_trajectory(root)
+    lens, remarks, data_set, is_y_up = _find_camera(root, intrinsics, camera, hw, K, fov)
+    unit = _find_unit(root, units_per_metre, data_set)
+    candidates = (root / "groundtruth.txt", *sorted(root.glob(_ICL_TRAJECTORIES)))
+    trajectory = next((file for file in candidates if file.is_file()), None)
     c2w = None
     if poses and trajectory is not None:
         interpolate = _match_numbers if is_numbered else _interpolate_trajectory
@@ -143,7 +143,7 @@ def read(
             report += _format_unmatched(int((~covered).sum()), "RGB-D frames", "pose", max_difference, is_numbered)
         pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
         times = times[covered]
-        if source.is_y_up:
+        if is_y_up:
             c2w = _FLIP_Y @ c2w @ _FLIP_Y
     rows = tuple(
         image_table.ImageRow(int(t) if is_numbered else i, colour[i][1], depth[j][1])
@@ -153,12 +153,12 @@ def read(
         rows=rows,
         hw=hw,
         depth_hw=image_table.read_depth_hw(rows[0].depth),
-        camera=source.camera,
+        camera=lens,
         units_per_metre=1 / unit.metres,
     )
-    if is_numbered and not source.is_icl:
+    has_times = not is_numbered or data_set == "ICL-NUIM"
+    if not has_times:
         report.append("images are numbered, not stamped: no times")
-    has_times = not is_numbered or source.is_icl
     load, stored = image_table.read_stored_sizes(load)
     return [
         Recording(
@@ -170,7 +170,7 @@ def read(
             times=torch.tensor(times / _RATE_HZ if is_numbered else times, dtype=torch.float64) if has_times else None,
             poses=None if c2w is None else convert.to_poses(c2w, trajectory or root),
             rate_hz=_RATE_HZ if has_times else None,
-            report=(*report, *source.report),
+            report=(*report, *remarks),
             depth_unit=unit,
             stored=stored,
         )
@@ -238,11 +238,6 @@ def _find_columns(words: Sequence[str], kind: str) -> list[str]:
     return list(words[max(place - 1, 0) : place + 1])
 
 
-def _find_trajectory(root: Path) -> Path | None:
-    candidates = (root / "groundtruth.txt", *sorted(root.glob(_ICL_TRAJECTORIES)))
-    return next((file for file in candidates if file.is_file()), None)
-
-
 def _match_numbers(file: Path, numbers: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices of the frames whose number has a row, and the mask (n,) of these frames."""
     rows = {row[0]: row for row in _read_trajectory(file)}
@@ -285,21 +280,6 @@ def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float
     return convert.to_c2w(q, (1 - weight) * a[:, 1:4] + weight * b[:, 1:4], file), covered
 
 
-@dataclass(frozen=True)
-class _CameraSource:
-    """Camera of a sequence, and what is known of the sequence by the way it was found."""
-
-    camera: Camera
-    report: tuple[str, ...] = ()
-    data_set: str | None = None  # whose unit of depth is documented; None = not known
-    is_y_up: bool = False  # whether camera and world of the trajectory have y up
-
-    @property
-    def is_icl(self) -> bool:
-        """Whether the sequence is one of ICL-NUIM."""
-        return self.data_set == "ICL-NUIM"
-
-
 def _find_camera(
     root: Path,
     intrinsics: intrinsics_options.IntrinsicsOption,
@@ -307,7 +287,8 @@ def _find_camera(
     hw: tuple[int, int],
     K: Sequence[float] | None,
     fov: float | None,
-) -> _CameraSource:
+) -> tuple[Camera, tuple[str, ...], str | None, bool]:
+    """Camera of a sequence, report, data set whose unit of depth is documented, whether its trajectory has y up."""
     if isinstance(intrinsics, str) and intrinsics not in ("camera", "ros"):
         raise FormatError(root, "option intrinsics", intrinsics, "camera or ros")
     if camera not in (None, "icl", *_CAMERA_CALIBRATIONS):
@@ -317,29 +298,35 @@ def _find_camera(
     data_set = "ICL-NUIM" if is_icl else None if number is None else "TUM RGB-D"
     option = intrinsics_options.parse_intrinsics(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
     calibration = next((root / name for name in _CALIBRATION_FILES if (root / name).is_file()), None)
+    report, side_car = option.report, root / "meta.json"
+    place, field = root, "K"
+    values: Sequence[float]
+    distortion: Sequence[float] | np.ndarray | None = None
     if option.K is not None:
-        source = _make_source(option.K, None, hw, root, "option K")
+        values, field = option.K, "option K"
     elif calibration is not None and camera is None and intrinsics == "camera":
-        values, distortion = _read_calibration(calibration)
-        source = _make_source(values, distortion, hw, calibration, "fx fy cx cy")
+        (values, distortion), place, field = _read_calibration(calibration), calibration, "fx fy cx cy"
     elif is_icl:
         matrix, scaled = image_table.fit_K(convert.make_K(*_ICL_INTRINSICS), _IMAGE_HW, hw, Path("ICL-NUIM"))
-        source = _CameraSource(convert.to_camera(matrix, hw, root), scaled)
+        return convert.to_camera(matrix, hw, root), (*scaled, *report), data_set, True
+    elif number is not None or intrinsics != "camera":
+        if hw != _IMAGE_HW:
+            raise FormatError(root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration")
+        values, distortion = _ROS_INTRINSICS, None
+        if number and intrinsics == "camera":
+            values, distortion = _CAMERA_CALIBRATIONS[number]
+    elif side_car.is_file():
+        meta = files.read_json(side_car)
+        return convert.to_camera(meta.get("K"), hw, side_car, "K", meta.get("dist")), report, data_set, False
     else:
-        source = _CameraSource(_make_camera(root, intrinsics, number, hw))
-    report = (*source.report, *option.report)
-    if source.is_y_up and not is_icl:  # ICL-NUIM's published K is known to have a negative fy
-        report = (*report, "K has a negative fy: that of a camera with y up; read as positive, poses are mirrored")
-    return replace(source, data_set=data_set, is_y_up=source.is_y_up or is_icl, report=report)
-
-
-def _make_source(
-    values: Sequence[float], distortion: np.ndarray | None, hw: tuple[int, int], file: Path, field: str
-) -> _CameraSource:
-    """Camera of fx fy cx cy; a negative fy is that of a camera with y up on upright images."""
+        raise intrinsics_options.missing_intrinsics_error(
+            root, None, "data.camera=1, 2, 3 (freiburg) or icl, data.intrinsics=ros", "calibration.txt, meta.json"
+        )
     fx, fy, cx, cy = values
-    camera = convert.to_camera(convert.make_K(fx, abs(fy), cx, cy), hw, file, field, distortion)
-    return _CameraSource(camera, is_y_up=fy < 0)
+    if fy < 0 and not is_icl:  # ICL-NUIM's published K is known to have a negative fy
+        report = (*report, "K has a negative fy: that of a camera with y up; read as positive, poses are mirrored")
+    K_up = convert.make_K(fx, abs(fy), cx, cy)
+    return convert.to_camera(K_up, hw, place, field, distortion), report, data_set, fy < 0 or is_icl
 
 
 def _read_calibration(file: Path) -> tuple[list[float], np.ndarray | None]:
@@ -357,32 +344,15 @@ def _read_calibration(file: Path) -> tuple[list[float], np.ndarray | None]:
     return values[:4], np.array(values[4:]) if values[4:] else None
 
 
-def _find_unit(root: Path, option: float | None, source: _CameraSource) -> DepthUnit:
+def _find_unit(root: Path, option: float | None, data_set: str | None) -> DepthUnit:
     side_car = root / "meta.json"
     if option is not None:
         units = files.to_positive(option, root, "option units_per_metre")
         return DepthUnit(1 / units, "option units_per_metre")
     if side_car.is_file() and "depth_scale" in (meta := files.read_json(side_car)):
         return DepthUnit(1 / files.to_positive(meta["depth_scale"], side_car, "depth_scale"), "meta.json: depth_scale")
-    stated = None if source.data_set is None else f"{source.data_set} stores 1/5000 m"
+    stated = None if data_set is None else f"{data_set} stores 1/5000 m"
     return DepthUnit(1 / _UNITS_PER_METRE, stated)
-
-
-def _make_camera(
-    root: Path, intrinsics: intrinsics_options.IntrinsicsOption, number: int | None, hw: tuple[int, int]
-) -> Camera:
-    side_car = root / "meta.json"
-    if number is None and intrinsics == "camera":
-        if not side_car.is_file():
-            raise intrinsics_options.missing_intrinsics_error(
-                root, None, "data.camera=1, 2, 3 (freiburg) or icl, data.intrinsics=ros", "calibration.txt, meta.json"
-            )
-        meta = files.read_json(side_car)
-        return convert.to_camera(meta.get("K"), hw, side_car, "K", meta.get("dist"))
-    if hw != _IMAGE_HW:
-        raise FormatError(root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration")
-    values, distortion = _CAMERA_CALIBRATIONS[number] if number and intrinsics == "camera" else (_ROS_INTRINSICS, None)
-    return convert.to_camera(convert.make_K(*values), hw, root, "K", distortion)
 
 
 def _is_icl(root: Path) -> bool:
