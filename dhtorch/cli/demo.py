@@ -17,10 +17,10 @@ from dhtorch.synthetic.recording import SyntheticRoom
 _N_FRAMES: Final = 6
 _IMAGE_HW: Final = (240, 320)
 
-#: Range of the simulated LiDAR, m: the room is 6 m deep, so that much lies beyond. Source: origin not recorded.
+#: Range of the simulated LiDAR, m: the room is 6 m deep, so that much lies beyond.
 _RANGE_M: Final = 2.5
 
-#: Step of the camera from frame to frame, m, that of a slow walk. Source: origin not recorded.
+#: Step of the camera from frame to frame, m, that of a slow walk.
 _STEP_M: Final = 0.05
 
 

@@ -7,9 +7,6 @@ import zlib
 
 import numpy as np
 
-#: Level of deflate: higher ones take longer and gain little.
-_DEFLATE_LEVEL = 6
-
 
 def encode_float_tiff(picture: np.ndarray, *, deflate: bool = False) -> bytes:
     """Numbers (h, w) → bytes of a float32 TIFF with one strip, little-endian; lossless.
@@ -20,7 +17,8 @@ def encode_float_tiff(picture: np.ndarray, *, deflate: bool = False) -> bytes:
     """
     h, w = picture.shape
     body = picture.astype("<f4").tobytes()
-    body = zlib.compress(body, _DEFLATE_LEVEL) if deflate else body
+    # Level of deflate: higher ones take longer and gain little.
+    body = zlib.compress(body, 6) if deflate else body
     compression = 8 if deflate else 1
     tags = [(256, w), (257, h), (258, 32), (259, compression), (262, 1), (273, 8), (277, 1), (278, h)]
     tags += [(279, len(body)), (339, 3)]

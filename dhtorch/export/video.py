@@ -28,9 +28,6 @@ LOSSLESS_CODEC, LOSSLESS_PIXELS = "h264", "gbrp"
 _PREVIEW_ENCODERS: Final = ("libx264", "mpeg4")
 _PREVIEW_OPTIONS: Final = {"crf": "20", "preset": "veryfast"}
 
-#: Largest denominator of a frame rate. Source: rates of NTSC, such as 30000 / 1001.
-_MAX_RATE_DENOMINATOR: Final = 1001
-
 
 @contextmanager
 def open_lossless_video(path: Path, hw: tuple[int, int], fps: float) -> Iterator[AppendFrame]:
@@ -43,7 +40,8 @@ def open_lossless_video(path: Path, hw: tuple[int, int], fps: float) -> Iterator
     """
     import av  # noqa: PLC0415
 
-    rate = Fraction(fps).limit_denominator(_MAX_RATE_DENOMINATOR)
+    # Largest denominator of a frame rate. Source: rates of NTSC, such as 30000 / 1001.
+    rate = Fraction(fps).limit_denominator(1001)
     with storage.write_atomically(path) as sink, av.open(sink, "w", format="mp4") as container:
         stream = container.add_stream(_ENCODER, rate=rate, options=dict(_OPTIONS))
         stream.height, stream.width = hw

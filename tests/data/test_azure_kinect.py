@@ -58,9 +58,13 @@ def test_both_tracks_are_read(tmp_path: Path, codec: str, names: tuple[str, str]
         torch.testing.assert_close(got.time, want.time - 100, atol=1e-3, rtol=0)
 
 
-def test_depth_is_registered_by_the_factorys_calibration(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rig", [None, [[0.2, -0.1, 0.3, 0.5, -0.2, 0.1]]])
+def test_depth_is_registered_by_the_factorys_calibration(tmp_path: Path, rig: list[list[float]] | None) -> None:
+    """Only the motion from the depth to the colour camera moves depth, in whatever frame their poses are stated."""
     frames = device_frames()
-    write_azure_kinect(tmp_path / "a.mkv", frames, T_colour_from_depth=T_COLOUR_FROM_DEPTH)
+    T_rig = None if rig is None else se3.exp(torch.tensor(rig).double())
+    poses = {"T_colour_from_depth": T_COLOUR_FROM_DEPTH, "T_depth_from_rig": T_rig}
+    write_azure_kinect(tmp_path / "a.mkv", frames, **poses)
     recording = data.open(tmp_path / "a.mkv")
     assert recording.report == () and "calibration.json" in recording.depth_unit.source
     for got, want in zip(recording, frames, strict=True):
@@ -141,22 +145,3 @@ def test_a_plain_video_is_no_recording(tmp_path: Path) -> None:
 def test_the_field_case() -> None:
     recording = data.open(Path(ROOT) / "field_cases/26-azure-kinect-mkv/capture.mkv", K=[525, 525, 319.5, 239.5])
     assert len(recording) == 5 and 0.9 < float(recording[0].depth[recording[0].depth > 0].min()) < 1.1
-
-
-def test_the_origin_of_the_rig_is_of_no_matter() -> None:
-    """Only the motion from the depth to the colour camera moves depth, in whatever frame their poses are stated."""
-    depth = device_frames(1)[0].depth[0]
-    plain = Camera(COLOUR.f, COLOUR.c)
-    maps = []
-    for rig in (torch.zeros(1, 6), torch.tensor([[0.2, -0.1, 0.3, 0.5, -0.2, 0.1]])):
-        T_depth_from_rig = se3.exp(rig.double())
-        lenses = [
-            azure_kinect._Lens(camera, 1.7, T)
-            for camera, T in (
-                (plain, se3.compose(T_COLOUR_FROM_DEPTH, T_depth_from_rig)),
-                (DEPTH, T_depth_from_rig),
-            )
-        ]
-        maps.append(azure_kinect._register(depth, azure_kinect._Calibration(*lenses), plain, (180, 320)))
-    assert bool((maps[0] > 0).any())
-    assert float(((maps[0] - maps[1]).abs() < 1e-3).double().mean()) > 0.98

@@ -301,45 +301,9 @@ def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------------- TIFF
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("kind", ["u1", "u2", "i2", "f2", "f4", "f8"])
-@pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
-def test_tiff_against_tifffile(tmp_path: Path, order: str, kind: str, compression: str | None) -> None:
-    picture = (np.random.default_rng(0).random((20, 30)) * 100).astype(kind)
-    file = tmp_path / "a.tiff"
-    tifffile.imwrite(file, picture, byteorder=order, compression=compression)
-    got = tiff.read_tiff(file, (20, 30))
-    assert got.dtype == picture.dtype and np.array_equal(got, picture)
-    with pytest.raises(FormatError, match=r"a.tiff: size: found 30x20, expected 20x30"):
-        tiff.read_tiff(file, (30, 20))
-
-
-def test_our_tiff_is_one() -> None:
+@pytest.mark.parametrize("deflate", [False, True])
+def test_our_tiff_is_one(deflate: bool) -> None:
     picture = np.random.default_rng(0).random((5, 7), dtype=np.float32)
-    assert np.array_equal(tifffile.imread(io.BytesIO(encode_float_tiff(picture))), picture)
-
-
-def test_bad_tiff(tmp_path: Path) -> None:
-    good = encode_float_tiff(np.ones((5, 7)))
-    directory = 8 + 5 * 7 * 4
-
-    def tag(number: int, value: int) -> bytes:
-        """The file with one tag changed."""
-        at = good.index(np.array([number, 4], "<u2").tobytes(), directory)
-        return good[: at + 8] + int(value).to_bytes(4, "little") + good[at + 12 :]
-
-    for content, message in (
-        (b"II+\0" + good[4:], "content: found b'II"),
-        (good[:100], "data: found "),
-        (tag(256, 2**31), "size: found 2147483648x5, expected 1 to|data"),
-        (tag(256, 0), "size: found 0x5"),
-        (tag(257, 6), "strips: found 140 bytes, expected 168 bytes"),
-        (tag(258, 12), "samples: found 12 bits"),
-        (tag(259, 7), "layout: found 1 samples per pixel, compression 7"),
-        (tag(259, 8), "data: found "),  # deflated, it says
-        (tag(273, 300), "strips: found 1 offsets, 1 sizes, expected all inside the file"),
-        (tag(277, 3), "layout: found 3 samples per pixel"),
-    ):
-        with pytest.raises(FormatError, match=message) as caught:
-            tiff.decode_tiff(content, Path("a.tiff"))
-        assert "\n" not in str(caught.value)
+    content = encode_float_tiff(picture, deflate=deflate)
+    assert np.array_equal(tifffile.imread(io.BytesIO(content)), picture)
+    assert np.array_equal(tiff.decode_tiff(content, Path("a.tiff"), (5, 7)), picture)

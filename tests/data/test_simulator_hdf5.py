@@ -13,7 +13,6 @@ from support.writers.simulator_hdf5 import write_simulator_hdf5
 
 from dhtorch import data
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import simulator_hdf5
 from dhtorch.records import Frame
 
 h5py = pytest.importorskip("h5py")
@@ -54,9 +53,14 @@ def test_every_layout_is_read_back(tmp_path: Path, layout: str) -> None:
     assert recordings[1].episode == 1 and recordings[1].camera_name == "front"
 
 
-def test_pictures_of_numbers_become_bytes() -> None:
-    numbers = np.array([[[0.0], [0.2], [0.75], [1.0], [1.5], [-0.1], [np.nan]]])
-    assert simulator_hdf5._to_bytes(numbers).ravel().tolist() == [0, 51, 191, 255, 255, 0, 0]
+def test_pictures_of_numbers_become_bytes(tmp_path: Path) -> None:
+    write_simulator_hdf5(tmp_path / "a.hdf5", [walk(1)], "maniskill3")
+    numbers = np.zeros((1, 48, 64, 3), np.float32)
+    numbers[0, 0, :7, 0] = [0.0, 0.2, 0.75, 1.0, 1.5, -0.1, np.nan]
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        del file["traj_0/obs/sensor_data/front/rgb"]
+        file["traj_0/obs/sensor_data/front/rgb"] = numbers
+    assert data.open(tmp_path / "a.hdf5")[0].image[0, 0, 0, :7].tolist() == [0, 51, 191, 255, 255, 0, 0]
 
 
 def test_one_pose_source_suffices(tmp_path: Path) -> None:

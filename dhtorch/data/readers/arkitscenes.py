@@ -34,9 +34,6 @@ from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime.console import format_count
 
-#: Gap between two pictures, in their median step, above which a picture is missing. Source: derived, half a step more.
-_LONG_GAP_STEPS = 1.5
-
 #: Colour assets and their folder names, in order of preference.
 _COLOUR_ASSETS = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
 
@@ -46,10 +43,6 @@ _UNITS_PER_METRE = 1000.0
 
 #: Largest difference in s of stamps of one instant: file names have milliseconds.
 _SAME_INSTANT_S = 0.0011
-#: Largest difference in s of a pose and an image with the same stamp rounded to milliseconds.
-_STAMP_ROUNDING_S = 0.00051
-#: Length of the mean gravity direction's projection onto the image plane below which the image is not rotated.
-_MIN_GRAVITY_IN_PLANE = 0.1
 
 
 def recognise(root: Path) -> str | None:
@@ -338,7 +331,9 @@ def _count_lost_pictures(times: np.ndarray, depth: _AssetMatch) -> int:
     unmatched = np.delete(depth.stamped.times, depth.at[depth.at >= 0])
     gaps, after = np.diff(times), np.searchsorted(times, unmatched)
     inside = (after > 0) & (after < len(times))
-    return int((gaps[after[inside] - 1] > _LONG_GAP_STEPS * np.median(gaps)).sum())
+    # Gap between two pictures, in their median step, above which a picture is missing. Source: derived, half a step
+    # more.
+    return int((gaps[after[inside] - 1] > 1.5 * np.median(gaps)).sum())
 
 
 def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:
@@ -377,7 +372,8 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
     R = convert.to_c2w(q, rows[:, 4:], file, "rotation")[:, :3, :3]  # world to camera
     centre = -np.einsum("nji,nj->ni", R, rows[:, 4:])
     inverse = q * [-1, -1, -1, 1]
-    limits = {"same": _STAMP_ROUNDING_S, "max_difference": max_difference, "max_gap": max_gap}
+    # Largest difference in s of a pose and an image with the same stamp rounded to milliseconds.
+    limits = {"same": 0.00051, "max_difference": max_difference, "max_gap": max_gap}
     q_at, t_at, covered = interpolate_poses(times, rows[:, 0], inverse, centre, **limits)
     return convert.to_c2w(q_at, t_at, file, "rotation"), covered
 
@@ -385,7 +381,8 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
 def _count_quarter_turns(c2w: np.ndarray, report: list[str]) -> int:
     """Number of clockwise quarter turns that put the sky on top, from the mean gravity over the frames."""
     x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up direction in camera axes
-    if max(abs(x), abs(y)) < _MIN_GRAVITY_IN_PLANE:
+    # Length of the mean gravity direction's projection onto the image plane below which the image is not rotated.
+    if max(abs(x), abs(y)) < 0.1:
         report.append("the camera looks straight up or down: images are not rotated")
         return 0
     if abs(x) > abs(y):

@@ -10,15 +10,13 @@ Frames are colour and depth maps stamped within half a period of one another, at
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
@@ -46,9 +44,6 @@ _DEPTH_MODES: Final = {
 }
 _SENSOR_ASPECT: Final = 3 / 4  # height by width of the colour sensor; modes of 16:9 are cropped alike above and below
 _LEGACY_ASPECT: Final = 9 / 16  # of colour calibrations by older firmware: the sensor cropped to 16:9
-#: Largest distance from the axis at depth 1 for which a lens model holds, where the calibration has none.
-#: Source: Azure Kinect SDK, intrinsic_transformation.c.
-_DEFAULT_METRIC_RADIUS: Final = 1.7
 _N_PARAMETERS: Final = 14  # cx cy fx fy k1 … k6 codx cody p2 p1
 
 
@@ -106,7 +101,7 @@ def read(
     if option.K is not None:
         camera = convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
     elif calibration is not None:
-        camera = calibration.colour.camera
+        camera = calibration[0].camera
     else:
         raise intrinsics_options.missing_intrinsics_error(root, None, f"an attachment {_CALIBRATION} in the video")
     if calibration is None and hw != depth_hw:
@@ -153,14 +148,6 @@ class _Lens(NamedTuple):
     T_cam_from_rig: Pose
 
 
-@dataclass(frozen=True, eq=False)
-class _Calibration:
-    """Both cameras of a device."""
-
-    colour: _Lens
-    depth: _Lens
-
-
 def _load_frame(
     i: int,
     *,
@@ -170,7 +157,7 @@ def _load_frame(
     hw: tuple[int, int],
     depth_hw: tuple[int, int],
     camera: Camera,
-    calibration: _Calibration | None,
+    calibration: tuple[_Lens, _Lens] | None,  # of colour and depth
 ) -> Frame:
     """Position → frame."""
     picture, depth_map = pairs[i].tolist()
@@ -178,22 +165,17 @@ def _load_frame(
     code = video.read_video_frame(file, depth_map, depth_hw, pixels="gray16le", track=tracks.depth)
     depth = torch.from_numpy(files.to_metres(code, _UNITS_PER_METRE))
     if calibration is not None:
-        depth = _register(depth, calibration, camera, hw)
+        # Depth map of the colour camera at the density of the depth camera.
+        of_colour, of_depth = calibration
+        v, u = torch.nonzero(depth > 0, as_tuple=True)
+        uv = torch.stack((u, v), -1).to(depth.dtype)
+        xyz = cameras.unproject(of_depth.camera, uv[None], depth[v, u][None])
+        T_colour_from_depth = se3.compose(of_colour.T_cam_from_rig, se3.invert(of_depth.T_cam_from_rig))
+        xyz = se3.apply(T_colour_from_depth.to(depth.dtype), xyz)[0]
+        is_modelled = xyz[:, :2].norm(dim=-1) <= of_colour.radius * xyz[:, 2]
+        size = convert.size_of_registered_depth(of_depth.camera, camera, hw)
+        depth = convert.splat_depth(xyz[is_modelled], cameras.resize(camera, hw, size), size)
     return Frame(torch.from_numpy(image).permute(2, 0, 1).contiguous()[None], depth[None], camera)
-
-
-def _register(depth: Tensor, calibration: _Calibration, camera: Camera, hw: tuple[int, int]) -> Tensor:
-    """Depth map of the colour camera at the density of the depth camera."""
-    v, u = torch.nonzero(depth > 0, as_tuple=True)
-    uv = torch.stack((u, v), -1).to(depth.dtype)
-    xyz = cameras.unproject(calibration.depth.camera, uv[None], depth[v, u][None])
-    T_colour_from_depth = se3.compose(
-        calibration.colour.T_cam_from_rig, se3.invert(calibration.depth.T_cam_from_rig)
-    ).to(depth.dtype)
-    xyz = se3.apply(T_colour_from_depth, xyz)[0]
-    is_modelled = xyz[:, :2].norm(dim=-1) <= calibration.colour.radius * xyz[:, 2]
-    size = convert.size_of_registered_depth(calibration.depth.camera, camera, hw)
-    return convert.splat_depth(xyz[is_modelled], cameras.resize(camera, hw, size), size)
 
 
 def _find_tracks(file: Path) -> _Tracks | None:
@@ -215,7 +197,8 @@ def _find_tracks(file: Path) -> _Tracks | None:
 # ------------------------------------------------------------------------------------------------------- calibration
 
 
-def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]) -> _Calibration | None:
+def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]) -> tuple[_Lens, _Lens] | None:
+    """Lenses of the colour and the depth camera; None without an attached calibration."""
     content = video.read_attachment(file, _CALIBRATION)
     if content is None:
         return None
@@ -223,24 +206,19 @@ def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]
     value = files.decode_json(content.rstrip(b"\0"), where)
     entries = files.get_entry(value, "CalibrationInformation.Cameras", list, where)
     by_location = {str(entry.get("Location")): entry for entry in entries if isinstance(entry, dict)}
-    colour, depth = (_find_location(by_location, name, where) for name in ("PV0", "D0"))
+    locations = [f"CALIBRATION_CameraLocation{name}" for name in ("PV0", "D0")]
+    if lost := [location for location in locations if location not in by_location]:
+        raise FormatError(where, "Cameras", ", ".join(by_location) or "none", lost[0])
+    colour, depth = (by_location[location] for location in locations)
     if depth_hw not in _DEPTH_MODES:
         size = f"{depth_hw[1]}x{depth_hw[0]}"
         expected = ", ".join(f"{w}x{h}" for h, w in _DEPTH_MODES)
         raise FormatError(file, "depth size", size, f"one of {expected}, the modes of {_CALIBRATION}")
     side, left, top = _DEPTH_MODES[depth_hw]
-    return _Calibration(
-        colour=_parse_lens(colour, _colour_grid(colour, hw, where), hw, where),
-        depth=_parse_lens(depth, (side, side, left, top), depth_hw, where),
+    return (
+        _parse_lens(colour, _colour_grid(colour, hw, where), hw, where),
+        _parse_lens(depth, (side, side, left, top), depth_hw, where),
     )
-
-
-def _find_location(by_location: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
-    location = f"CALIBRATION_CameraLocation{name}"
-    if location not in by_location:
-        raise FormatError(file, "Cameras", ", ".join(by_location) or "none", location)
-    entry: dict[str, Any] = by_location[location]
-    return entry
 
 
 def _colour_grid(entry: dict[str, Any], hw: tuple[int, int], file: Path) -> tuple[float, float, float, float]:
@@ -275,4 +253,6 @@ def _parse_lens(
     T = np.eye(4)
     T[:3, :3] = files.to_array(files.get_entry(entry, "Rt.Rotation", list, file), (9,), file, "Rotation").reshape(3, 3)
     T[:3, 3] = files.to_array(files.get_entry(entry, "Rt.Translation", list, file), (3,), file, "Translation")
-    return _Lens(camera, radius if radius > 0 else _DEFAULT_METRIC_RADIUS, convert.to_poses(T[None], file, "Rt"))
+    # Largest distance from the axis at depth 1 for which a lens model holds, where the calibration has none. Source:
+    # Azure Kinect SDK, intrinsic_transformation.c.
+    return _Lens(camera, radius if radius > 0 else 1.7, convert.to_poses(T[None], file, "Rt"))

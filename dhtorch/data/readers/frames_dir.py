@@ -61,9 +61,6 @@ _INTRINSICS_FILES = (
 #: Depth codes of one metre where nothing states another. Source: convention of the layout, millimetres.
 _UNITS_PER_METRE = 1000.0
 
-#: Largest relative difference of two matrices that state one camera. Source: chosen: rounding to three digits.
-_SAME_K_REL = 1e-3
-
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
@@ -296,7 +293,8 @@ def _compare_with_file(root: Path, *used: tuple[object, Path, str] | None) -> li
         return []
     stated = read_K(file)
     matrices = [files.to_array(source[0], (3, 3), *source[1:]) for source in used if source is not None]
-    if any(np.allclose(K, stated, rtol=_SAME_K_REL) for K in matrices):
+    # Largest relative difference of two matrices that state one camera. Source: chosen: rounding to three digits.
+    if any(np.allclose(K, stated, rtol=1e-3) for K in matrices):
         return []
     return [
         f"{file.name} states another K than the one in use: f {stated[0, 0]:g}, c {stated[0, 2]:g} {stated[1, 2]:g}"

@@ -36,18 +36,9 @@ NAMED_COLOUR_PATTERN = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
 #: Name with a running number and a time stamp in microseconds, as SUN3D's and Redwood's ``0000012-000000366966``.
 _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{9,})")
 
-#: Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most this number for depths
-#: below 3/8 of the range (24.6 m in mm); plain codes have all 8 numbers there. Source: derived.
-_MAX_LOW_BITS = 2
-#: Least share of non-zero codes with such lower bits in rotated codes; 3/8 of plain codes have them. Source: chosen
-#: between 3/8 and 1.
-_MIN_ROTATED = 0.7
 
 _K_EXPECTED = "fx fy cx cy, or a 3x3 or 4x4 matrix"
 
-#: Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of the
-#: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
-_MAX_ASPECT_ERROR = 0.01
 
 #: Names of depth files that are decoded by the PGM codec.
 _PGM_SUFFIX = ".pgm"
@@ -124,7 +115,11 @@ def choose_rotated_bits(file: Path, rotated: bool | None, whose: str) -> tuple[i
     if rotated is None:
         code = files.read_depth_png(file, 1).astype(np.uint16)
         returns = code[code > 0]
-        rotated = returns.size == 0 or float((returns % 8 <= _MAX_LOW_BITS).mean()) >= _MIN_ROTATED
+        # Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most this number for
+        # depths below 3/8 of the range (24.6 m in mm); plain codes have all 8 numbers there. Source: derived.
+        # Least share of non-zero codes with such lower bits in rotated codes; 3/8 of plain codes have them. Source:
+        # chosen between 3/8 and 1.
+        rotated = returns.size == 0 or float((returns % 8 <= 2).mean()) >= 0.7
     if rotated:
         return 3, ()
     return 0, (f"depth codes are not rotated by 3 bits, unlike {whose}: read unrotated (data.rotated=true)",)
@@ -411,7 +406,9 @@ def fit_K(
     if stated_hw == hw:
         return K, ()
     sizes = f"{hw[1]}x{hw[0]}", f"{stated_hw[1]}x{stated_hw[0]}"
-    if abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > _MAX_ASPECT_ERROR:
+    # Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of
+    # the shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
+    if abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01:
         raise FormatError(file, "image size", sizes[1], f"{sizes[0]} as the images, or the same aspect ratio (data.K)")
     report = f"images of {sizes[0]}, {file.name} states K for {sizes[1]}: K is scaled"
     return convert.resize_K(K, stated_hw, hw), (report,)

@@ -50,9 +50,6 @@ _UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
 #: Name of the map of origins that ``dhtorch enrich`` adds.
 _ORIGIN_KEY = "dhtorch_source_file_path"
 
-#: Largest error of the rotation in ``applied_transform`` that is rounding. Source: chosen on: six printed digits.
-_MAX_ROTATION_ERROR = 1e-4
-
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
@@ -241,7 +238,9 @@ def _parse_applied(meta: Mapping[str, Any], file: Path) -> tuple[np.ndarray, lis
     if meta.get("applied_transform") is not None:
         applied = parse_matrix(meta["applied_transform"], file, "applied_transform")
         R = applied[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() > _MAX_ROTATION_ERROR or np.linalg.det(R) < 0:
+        # Largest error of the rotation in ``applied_transform`` that is rounding. Source: chosen on: six printed
+        # digits.
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
             raise FormatError(file, "applied_transform", R.tolist(), "a rotation and a translation")
     scale = files.to_positive(meta.get("applied_scale", 1.0), file, "applied_scale")
     if scale != 1:

@@ -39,10 +39,6 @@ _UNITS_PER_METRE = 1000.0
 #: Lines of one block of a trajectory: three integers and four rows. Source: format definition.
 _BLOCK_LINES = 5
 
-#: Largest number of bytes of a file that is searched for an intrinsic matrix at recognition; the files hold under 1 kB.
-#: Source: chosen.
-_MAX_INTRINSICS_BYTES = 100_000
-
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
@@ -136,11 +132,9 @@ def _find_intrinsics(root: Path) -> Path | None:
     """The first JSON file of the folder with an intrinsic matrix; None where there is none."""
     for file in sorted(root.glob("*.json")):
         with contextlib.suppress(FormatError):
-            if (
-                file.is_file()
-                and file.stat().st_size <= _MAX_INTRINSICS_BYTES
-                and _MATRIX_FIELD in files.read_json(file)
-            ):
+            # Largest number of bytes of a file that is searched for an intrinsic matrix at recognition; the files
+            # hold under 1 kB. Source: chosen.
+            if file.is_file() and file.stat().st_size <= 100_000 and _MATRIX_FIELD in files.read_json(file):
                 return file
     return None
 

@@ -30,14 +30,11 @@ _FOLDERS = {"corrected_cameras": "corrected_images", "cameras": "images"}
 #: Unit of the depth maps. Source: Polycam's description of its raw data.
 _UNIT = DepthUnit(1e-3, "format definition: Polycam stores millimetres")
 
-#: Code of high confidence. Source: Polycam's description; medium is 127 there and 54 in other exports.
-_HIGH_CONFIDENCE = 255
-
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
-    keyframes = _find_keyframes(root)
-    return None if keyframes is None else f"{keyframes.name}/ with {' and '.join(_select_folders(keyframes))}"
+    found = _find_folders(root)
+    return None if found is None else f"{found[0].name}/ with {' and '.join(found[1])}"
 
 
 def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
@@ -55,10 +52,11 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
         FormatError: no camera with an image, a damaged file, or values that are no camera or pose.
     """
     root = Path(root)
-    keyframes = _find_keyframes(root)
-    if keyframes is None:
+    found = _find_folders(root)
+    if found is None:
         raise FormatError(root, "folders", "none", "keyframes/ with cameras/ and images/")
-    cameras, images = _select_folders(keyframes) if corrected else ("cameras", "images")
+    keyframes, folders = found
+    cameras, images = folders if corrected else ("cameras", "images")
     pictures, depths = list_images(keyframes / images), list_images(keyframes / "depth")
     confidences = list_images(keyframes / "confidence")
     sources = {file.stem: file for file in sorted((keyframes / cameras).glob("*.json"))}
@@ -85,22 +83,13 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
     ]
 
 
-def _find_keyframes(root: Path) -> Path | None:
-    """The folder with the cameras: ``keyframes``, or the path itself; None where there is none."""
-    return next((folder for folder in (root / "keyframes", root) if _existing_folders(folder)), None)
-
-
-def _existing_folders(keyframes: Path) -> list[tuple[str, str]]:
-    """Names of the pairs of folders (cameras, images) that exist and have a camera."""
-    return [
-        (cameras, images)
-        for cameras, images in _FOLDERS.items()
-        if (keyframes / images).is_dir() and any((keyframes / cameras).glob("*.json"))
-    ]
-
-
-def _select_folders(keyframes: Path) -> tuple[str, str]:
-    return _existing_folders(keyframes)[0]
+def _find_folders(root: Path) -> tuple[Path, tuple[str, str]] | None:
+    """The folder with the cameras (``keyframes``, or the path itself), and its first pair of folders with a camera."""
+    for keyframes in (root / "keyframes", root):
+        for cameras, images in _FOLDERS.items():
+            if (keyframes / images).is_dir() and any((keyframes / cameras).glob("*.json")):
+                return keyframes, (cameras, images)
+    return None
 
 
 def _parse_row(source: Path, number: int, image: Path, depth: Path | None, conf: Path | None) -> PosedImage:
@@ -127,4 +116,5 @@ def _parse_row(source: Path, number: int, image: Path, depth: Path | None, conf:
 
 def _level_of_code(code: np.ndarray) -> np.ndarray:
     """Stored confidence → 0 low, 1 medium, 2 high."""
-    return np.where(code == _HIGH_CONFIDENCE, 2, np.where(code > 0, 1, 0))
+    # Code of high confidence. Source: Polycam's description; medium is 127 there and 54 in other exports.
+    return np.where(code == 255, 2, np.where(code > 0, 1, 0))

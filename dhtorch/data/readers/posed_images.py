@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,18 +27,6 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import NO_DEPTH_CODES
 from dhtorch.records import Frame
-
-#: Most digits of a number in a file's name that counts frames; longer numbers are time stamps. Source: chosen on: a
-#: week at 100 Hz has 8 digits, time stamps in µs since a phone's start have 10 or more.
-_MAX_COUNTER_DIGITS = 9
-
-#: Largest median time between two images in s; beyond it the stamps are no seconds. Source: chosen on: nanoseconds and
-#: microseconds of video give 1e4 or more, images of a person walking from place to place far less.
-_MAX_STEP_S = 1000.0
-
-
-#: EXIF orientations from which on width and height are exchanged. Source: EXIF 2.3, tag 0x0112.
-_FIRST_TRANSPOSING_ORIENTATION = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,32 +46,28 @@ class PosedImage:
     number: int = -1  # in the capture; negative = not numbered
 
 
-@dataclass(frozen=True, eq=False)
-class PosedImageLoader:
+def _load_frame(
+    i: int,
+    *,
+    rows: tuple[PosedImage, ...],
+    hw: tuple[int, int],
+    depth_hw: tuple[int, int],
+    step_m: float,  # metres of one step of the stored depth
+    exif: int,  # orientation tag of every image
+    level_of_code: Callable[[np.ndarray], np.ndarray] | None = None,  # stored confidence → 0, 1 or 2; None = not read
+) -> Frame:
     """Position → frame, decoded from its files."""
-
-    rows: tuple[PosedImage, ...]
-    hw: tuple[int, int]
-    depth_hw: tuple[int, int]
-    step_m: float  # metres of one step of the stored depth
-    exif: int  # orientation tag of every image
-    level_of_code: Callable[[np.ndarray], np.ndarray] | None = None  # stored confidence → 0, 1 or 2; None = not read
-
-    def __call__(self, i: int) -> Frame:
-        """Frame ``i``."""
-        row = self.rows[i]
-        camera = convert.to_camera(row.K, self.hw, row.source, f"intrinsics of {row.image.name}", row.distortion)
-        conf = None
-        if self.level_of_code is not None and row.conf is not None:
-            levels = self.level_of_code(files.read_image(row.conf, self.depth_hw)[0])
-            conf = torch.from_numpy(np.ascontiguousarray(levels, np.uint8))[None]
-        image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
-        depth = (
-            np.zeros(self.depth_hw) if row.depth is None else read_depth_steps(row.depth, self.depth_hw) * self.step_m
-        )
-        if row.depth is not None and row.origin is not None:
-            depth[files.read_image(row.origin, self.depth_hw)[0] != Source.SENSOR] = 0
-        return Frame(image[None], torch.from_numpy(depth.astype(np.float32))[None], camera, conf=conf)
+    row = rows[i]
+    camera = convert.to_camera(row.K, hw, row.source, f"intrinsics of {row.image.name}", row.distortion)
+    conf = None
+    if level_of_code is not None and row.conf is not None:
+        levels = level_of_code(files.read_image(row.conf, depth_hw)[0])
+        conf = torch.from_numpy(np.ascontiguousarray(levels, np.uint8))[None]
+    image = torch.from_numpy(files.read_image(row.image, hw, exif))
+    depth = np.zeros(depth_hw) if row.depth is None else read_depth_steps(row.depth, depth_hw) * step_m
+    if row.depth is not None and row.origin is not None:
+        depth[files.read_image(row.origin, depth_hw)[0] != Source.SENSOR] = 0
+    return Frame(image[None], torch.from_numpy(depth.astype(np.float32))[None], camera, conf=conf)
 
 
 def open_posed_images(
@@ -137,7 +122,15 @@ def open_posed_images(
     return Recording(
         name=name or root.resolve().name,
         format=format,
-        load=PosedImageLoader(tuple(rows), hw, first[0], step_m, header.orientation, level_of_code),
+        load=partial(
+            _load_frame,
+            rows=tuple(rows),
+            hw=hw,
+            depth_hw=first[0],
+            step_m=step_m,
+            exif=header.orientation,
+            level_of_code=level_of_code,
+        ),
         number=torch.tensor([row.number for row in rows] if rows[0].number >= 0 else list(range(len(rows)))),
         root=root,
         times=times,
@@ -154,7 +147,9 @@ def sort_posed_images(rows: Sequence[PosedImage]) -> list[PosedImage]:
     counted = []
     for row in rows:
         match = re.search(r"(\d+)\D*$", row.image.stem)  # the last number in the name, if it can count frames
-        number = int(match[1]) if match and len(match[1]) <= _MAX_COUNTER_DIGITS else -1
+        # Most digits of a number in a file's name that counts frames; longer numbers are time stamps. Source: chosen
+        # on: a week at 100 Hz has 8 digits, time stamps in µs since a phone's start have 10 or more.
+        number = int(match[1]) if match and len(match[1]) <= 9 else -1
         counted.append(row if row.number >= 0 else replace(row, number=number))
     numbers = [row.number for row in counted]
     if min(numbers, default=0) >= 0 and len(set(numbers)) == len(numbers):
@@ -242,7 +237,8 @@ def _fit_cameras(rows: Sequence[PosedImage], hw: tuple[int, int], exif: int) -> 
     """
     fitted, report = [], dict[str, None]()
     for row in rows:
-        if exif >= _FIRST_TRANSPOSING_ORIENTATION and row.hw == hw[::-1]:
+        # EXIF orientations from which on width and height are exchanged. Source: EXIF 2.3, tag 0x0112.
+        if exif >= 5 and row.hw == hw[::-1]:
             fitted.append(row)
             continue
         K, lines = fit_K(row.K, row.hw or hw, hw, row.source)
@@ -262,6 +258,8 @@ def _parse_times(rows: Sequence[PosedImage]) -> tuple[Tensor | None, list[str]]:
     steps = times.diff()
     if not bool(times.isfinite().all()) or not bool((steps > 0).all()):
         return None, ["time stamps do not increase with the numbers of the images: there are no times"]
-    if len(steps) and float(steps.median()) > _MAX_STEP_S:
+    # Largest median time between two images in s; beyond it the stamps are no seconds. Source: chosen on: nanoseconds
+    # and microseconds of video give 1e4 or more, images of a person walking from place to place far less.
+    if len(steps) and float(steps.median()) > 1000.0:
         return None, [f"time stamps step by {float(steps.median()):.6g}, no seconds: there are no times"]
     return times, []

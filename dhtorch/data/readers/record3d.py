@@ -14,8 +14,9 @@ positive is *no return*; time stamps count from the first one; ``initPose`` is n
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,8 @@ def read(
     report += uncovered + remarks + files.format_left_out(sorted(unposed), "its pose is not usable (tracking lost)")
     if not posed:
         raise FormatError(inner, "frames", "; ".join(report) or "none", _WHOLE_EXPORT)
-    load = _Load(tuple(posed), meta, *_find_sizes(posed, meta), exr_channel)
+    hw, depth_hw = _find_sizes(posed, meta)
+    load = partial(_load_frame, shots=tuple(posed), meta=meta, hw=hw, depth_hw=depth_hw, exr_channel=exr_channel)
     intact = [i for i, shot in enumerate(posed) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
     report += files.format_left_out([shot.number for i, shot in enumerate(posed) if i not in set(intact)], "damaged")
     if not intact:
@@ -126,14 +128,14 @@ def read(
         Recording(
             name=name,
             format="record3d",
-            load=replace(load, shots=tuple(posed[i] for i in intact)),
+            load=partial(load, shots=tuple(posed[i] for i in intact)),
             number=number,
             root=root,
             times=times,
             poses=None if c2w is None else convert.to_poses(c2w[intact], table.path),
             rate_hz=meta.fps,
             report=tuple(report + remarks),
-            stored=StoredSizes.of_images(load.hw, load.depth_hw, exif),
+            stored=StoredSizes.of_images(hw, depth_hw, exif),
         )
     ]
 
@@ -161,45 +163,41 @@ class _Metadata:
     stamps: np.ndarray | None  # (n,) s
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    shots: tuple[_Shot, ...],
+    meta: _Metadata,
+    hw: tuple[int, int],
+    depth_hw: tuple[int, int],
+    exr_channel: str | None,
+) -> Frame:
     """Position → frame."""
-
-    shots: tuple[_Shot, ...]
-    meta: _Metadata
-    hw: tuple[int, int]
-    depth_hw: tuple[int, int]
-    exr_channel: str | None
-
-    def __call__(self, i: int) -> Frame:
-        shot, meta = self.shots[i], self.meta
-        image = files.decode_image(shot.image.read(), shot.image.path, self.hw)
-        row = meta.K[shot.number if len(meta.K) > 1 else 0]
-        K = convert.resize_K(convert.make_K(*row), meta.hw, self.hw)
-        return Frame(
-            image=torch.from_numpy(image)[None],
-            depth=torch.from_numpy(self._depth(shot.depth))[None],
-            camera=convert.to_camera(K, self.hw, meta.file, f"intrinsics of frame {shot.number}"),
-            conf=None if shot.conf is None else torch.from_numpy(self._conf(shot.conf))[None],
-        )
-
-    def _depth(self, part: Member) -> np.ndarray:
-        if part.path.suffix == ".exr":
-            depth = codec_exr.decode_exr(part.read(), part.path, self.exr_channel, self.depth_hw)
-        else:
-            h, w = self.depth_hw
-            depth = np.frombuffer(lzfse.decompress_lzfse(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(
-                h, w
-            )
-        with np.errstate(invalid="ignore"):
-            return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-    def _conf(self, part: Member) -> np.ndarray:
-        h, w = self.depth_hw
-        conf = np.frombuffer(lzfse.decompress_lzfse(part.read(), h * w, part.path, "confidence"), np.uint8)
-        if conf.max() > 2:
-            raise FormatError(part.path, "confidence", int(conf.max()), "0, 1 or 2")
-        return conf.reshape(h, w).copy()
+    shot = shots[i]
+    image = files.decode_image(shot.image.read(), shot.image.path, hw)
+    row = meta.K[shot.number if len(meta.K) > 1 else 0]
+    K = convert.resize_K(convert.make_K(*row), meta.hw, hw)
+    h, w = depth_hw
+    part, conf = shot.depth, None
+    if part.path.suffix == ".exr":
+        depth = codec_exr.decode_exr(part.read(), part.path, exr_channel, depth_hw)
+    else:
+        content = lzfse.decompress_lzfse(part.read(), 4 * h * w, part.path, "depth")
+        depth = np.frombuffer(content, "<f4").reshape(h, w)
+    with np.errstate(invalid="ignore"):
+        usable = np.isfinite(depth) & (depth > 0)
+    if shot.conf is not None:
+        content = lzfse.decompress_lzfse(shot.conf.read(), h * w, shot.conf.path, "confidence")
+        levels = np.frombuffer(content, np.uint8)
+        if levels.max() > 2:
+            raise FormatError(shot.conf.path, "confidence", int(levels.max()), "0, 1 or 2")
+        conf = torch.from_numpy(levels.reshape(1, h, w).copy())
+    return Frame(
+        image=torch.from_numpy(image)[None],
+        depth=torch.from_numpy(np.where(usable, depth, np.float32(0)))[None],
+        camera=convert.to_camera(K, hw, meta.file, f"intrinsics of frame {shot.number}"),
+        conf=conf,
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- metadata
@@ -350,7 +348,7 @@ def _is_damaged(shot: _Shot) -> bool:
     )
 
 
-def _can_decode(load: _Load, i: int) -> bool:
+def _can_decode(load: Callable[[int], Frame], i: int) -> bool:
     try:
         load(i)
     except FormatError:

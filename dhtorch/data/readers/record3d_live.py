@@ -23,7 +23,6 @@ from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.records import Frame, Pose
 
 _SOURCE = Path("record3d:usb")
-_LIDAR_DEVICE_TYPE = 1  # 0 is the front camera, without confidence and poses
 
 
 class LiveFrames:
@@ -123,7 +122,8 @@ class LiveFrames:
         hw = (rgb.shape[0], rgb.shape[1])
         camera = convert.to_camera(convert.make_K(k.fx, k.fy, k.tx, k.ty), hw, _SOURCE, "intrinsics")
         usable = np.isfinite(depth) & (depth > 0)
-        lidar = self.stream.get_device_type() == _LIDAR_DEVICE_TYPE
+        # 0 is the front camera, without confidence and poses
+        lidar = self.stream.get_device_type() == 1
         return Frame(
             image=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))[None],
             depth=torch.from_numpy(np.where(usable, depth, np.float32(0)))[None],

@@ -30,7 +30,6 @@ _METADATA_START = b'{"intrinsicMatrix"'
 _TAIL_BYTES = 1 << 20  # bytes at the end of the file that are searched for the intrinsics
 _DEFAULT_RANGE_M = (0.0, 3.0)  # m
 _KEPT_RANGE_RATIO = (0.1 / 3, 2.8 / 3)  # of the range, as kept by the app's own viewer
-_MIN_CHROMA = 0.25  # of the maximum: coded pixels are saturated, grey has no hue
 
 
 def recognise(file: Path) -> str | None:
@@ -125,7 +124,8 @@ def decode_hue_depth(
     sixth = np.where(top == r, (g - b) / c % 6, np.where(top == g, (b - r) / c + 2, (r - g) / c + 4))
     hue = sixth / 6
     depth = near + hue * (far - near)
-    usable = (hue >= _KEPT_RANGE_RATIO[0]) & (hue < _KEPT_RANGE_RATIO[1]) & (chroma >= 255 * _MIN_CHROMA)
+    # of the maximum: coded pixels are saturated, grey has no hue
+    usable = (hue >= _KEPT_RANGE_RATIO[0]) & (hue < _KEPT_RANGE_RATIO[1]) & (chroma >= 255 * 0.25)
     jump = np.maximum(_window_extreme(depth, np.maximum) - depth, depth - _window_extreme(depth, np.minimum)) > max_step
     return np.where(usable & ~jump, depth, 0).astype(np.float32)
 

@@ -29,10 +29,6 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
-#: Disparities in px (with ``doffs``) up to this value give no depth: they are too small to be measured.
-_MIN_DISPARITY_PX = 1e-3
-
-
 #: Focal length of the Middlebury 2005 and 2006 pictures at full size, px, and their baseline, m.
 #: Source: https://vision.middlebury.edu/stereo/data/scenes2005/.
 _VIEWS_FOCAL_PX, _VIEWS_BASELINE_M = 3740.0, 0.16
@@ -125,7 +121,8 @@ class _LoadPair:
             code = _read_disparity(file, self.hw)
             disparity = code.astype(np.float64) / self.codes_per_px + self.doffs
             is_known = code > 0 if file.suffix == ".png" else np.isfinite(disparity)
-            usable = is_known & (disparity > _MIN_DISPARITY_PX)
+            # Disparities in px (with ``doffs``) up to this value give no depth: they are too small to be measured.
+            usable = is_known & (disparity > 1e-3)
             f = camera.f[0, 0].double().item()
             depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
         return Frame(image[None], torch.from_numpy(depth)[None], camera)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,6 @@ from dhtorch.runtime.console import format_count
 
 __all__ = ["RobotStream", "read", "read_robot_streams", "recognise"]
 
-_RATE_HZ = 10.0
 
 #: Depth codes of one metre. Source: format definition (rh20t_api).
 _UNITS_PER_METRE = 1000
@@ -129,30 +129,29 @@ def read(
     return [rig.recording(s, left_out, s in doubtful_serials) for s in opened]
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
+def _load_frame(
+    i: int,
+    *,
+    colour: Path,
+    depth: Path | None,
+    places: tuple[tuple[int, int], ...],  # index of the colour frame, index of the depth frame
+    camera: Camera,
+    hw: tuple[int, int],
+    depth_hw: tuple[int, int],
+    outlier: float,
+) -> Frame:
     """Position → frame."""
-
-    colour: Path
-    depth: Path | None
-    places: tuple[tuple[int, int], ...]  # index of the colour frame, index of the depth frame
-    camera: Camera
-    hw: tuple[int, int]
-    depth_hw: tuple[int, int]
-    outlier: float
-
-    def __call__(self, i: int) -> Frame:
-        k, j = self.places[i]
-        image = torch.from_numpy(read_video_frame(self.colour, k, self.hw)).permute(2, 0, 1).contiguous()
-        return Frame(image[None], self._depth(j)[None], self.camera)
-
-    def _depth(self, j: int) -> Tensor:
-        h, w = self.depth_hw
-        if self.depth is None:
-            return torch.zeros(h, w)
-        planes = read_video_frame(self.depth, j, (2 * h, w), pixels="gray")
-        depth = torch.from_numpy(planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256) / _UNITS_PER_METRE
-        return _remove_outliers(depth, self.outlier) if self.outlier > 0 else depth
+    k, j = places[i]
+    image = torch.from_numpy(read_video_frame(colour, k, hw)).permute(2, 0, 1).contiguous()
+    h, w = depth_hw
+    metres = torch.zeros(h, w)
+    if depth is not None:
+        planes = read_video_frame(depth, j, (2 * h, w), pixels="gray")
+        codes = planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256
+        metres = torch.from_numpy(codes) / _UNITS_PER_METRE
+    if outlier > 0:
+        metres = _remove_outliers(metres, outlier)
+    return Frame(image[None], metres[None], camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +199,8 @@ class _SceneCameras:
         return Recording(
             name=f"{self.root.resolve().name}/{serial}",
             format="rh20t",
-            load=_Load(
+            load=partial(
+                _load_frame,
                 colour=colour,
                 depth=depth if depth.is_file() else None,
                 places=places,
@@ -213,7 +213,7 @@ class _SceneCameras:
             root=self.root,
             times=torch.from_numpy(times[kept]),
             poses=poses,
-            rate_hz=header.rate_hz or _RATE_HZ,
+            rate_hz=header.rate_hz or 10.0,
             report=tuple(notes),
             depth_unit=DepthUnit(1 / _UNITS_PER_METRE, "RH20T stores mm") if depth.is_file() else None,
         )

@@ -17,7 +17,6 @@ from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 
-_MAX_STAMP_MS = 4_102_444_800_000  # the year 2100
 _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -183,7 +182,8 @@ def ms_to_seconds(value: Any, file: Path, field: str) -> float:
     Raises:
         FormatError: not a number, or a time outside 1970 to 2100.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_STAMP_MS:
+    # the year 2100
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 4_102_444_800_000:
         raise FormatError(file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds")
     return value / 1000
 

@@ -36,10 +36,8 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame, Pose
 
 _SUFFIXES: Final = (".h5", ".hdf5")
-_MAX_DIGITS: Final = 18  # of an episode's number: more do not fit into 64 bits
 _EPISODE: Final = re.compile(r"(?:demo|traj|episode)_(\d+)")
 _CODES_PER_METRE: Final = 1000.0  # of whole numbers: millimetres. Source: ManiSkill 3, sensor_data depth
-_MANISKILL_2_CODES_PER_METRE: Final = 1024.0  # Source: ManiSkill 2, RecordEpisode
 
 
 def recognise(root: Path) -> str | None:
@@ -155,7 +153,8 @@ def _make_recording(
         metres=1 / arrays.codes_per_metre if is_whole else 1.0,
         planes=planes,
     )
-    number = int(episode.rpartition("_")[2][:_MAX_DIGITS])
+    # of an episode's number: more do not fit into 64 bits
+    number = int(episode.rpartition("_")[2][:18])
     return Recording(
         name=names[i],
         format="simulator_hdf5",
@@ -194,17 +193,10 @@ def _load_frame(
     with np.errstate(invalid="ignore"):
         metric = np.where(np.isfinite(metric) & (metric > 0), metric, np.float32(0))
     camera = camera if camera.f.shape[0] == 1 else camera[i : i + 1]
-    picture = torch.from_numpy(np.ascontiguousarray(_to_bytes(image)[..., :3].transpose(2, 0, 1)))
+    if image.dtype != np.uint8:  # numbers from 0 to 1
+        image = (np.nan_to_num(image.astype(np.float32)) * 255).clip(0, 255).round().astype(np.uint8)
+    picture = torch.from_numpy(np.ascontiguousarray(image[..., :3].transpose(2, 0, 1)))
     return Frame(picture[None], torch.from_numpy(metric)[None], camera)
-
-
-def _to_bytes(image: np.ndarray) -> np.ndarray:
-    """Picture (H, W, C) uint8 of bytes or of numbers from 0 to 1."""
-    if image.dtype == np.uint8:
-        return image
-    scaled = np.nan_to_num(image.astype(np.float32)) * 255
-    rounded: np.ndarray = scaled.clip(0, 255).round().astype(np.uint8)
-    return rounded
 
 
 # --------------------------------------------------------------------------------------------------------------- file
@@ -224,9 +216,10 @@ def _list_cameras(file: Path, episode: str) -> list[_Arrays]:
     if list_hdf5_group(file, episode).get("obs", 0) is not None:
         return []
     obs = list_hdf5_group(file, f"{episode}/obs")
+    # Source: ManiSkill 2, RecordEpisode
     for data, parameters, codes, layout in (
         ("sensor_data", "sensor_param", _CODES_PER_METRE, "ManiSkill 3"),
-        ("image", "camera_param", _MANISKILL_2_CODES_PER_METRE, "ManiSkill 2"),
+        ("image", "camera_param", 1024.0, "ManiSkill 2"),
     ):
         if obs.get(data, 0) is None:
             path, cameras = f"{episode}/obs", []

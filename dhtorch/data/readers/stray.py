@@ -42,13 +42,10 @@ _INTRINSICS_COLUMNS = ("fx", "fy", "cx", "cy")
 _DEFAULT_HW = (1440, 1920)  # of the images, where there is no video
 _UNITS_PER_METRE = 1000.0
 _DEPTH_UNIT = DepthUnit(1 / _UNITS_PER_METRE, "Stray Scanner's definition of depth/*.png")
-_N_TRIAL_FRAMES = 6  # frames decoded to determine whether the first or last video frames were lost
 #: Lead of one pairing's edge score over the other's that each of these frames must show. Source: chosen: the right
 #: pairing leads by 0.077 or more in the built-in room at 12 cm from frame to frame; on holo_stream and
 #: 7s_redkitchen_400, where frames differ little, a wrong one leads by 0.09 in single frames, but not in all.
 _MIN_EDGE_LEAD = 0.06
-#: Ratio of the clocks of film and rows from which it is reported. Source: chosen: 60 and 59.94 Hz are one rate.
-_MIN_CLOCK_FACTOR = 1.02
 
 
 #: Files of the app that hold neither cameras nor poses.
@@ -340,7 +337,9 @@ def _choose_pairing(
     if len(candidates) == 1:
         factor = early.speed if early.speed > 1 else 1 / early.speed
         word = "fast" if early.speed > 1 else "slow"
-        pace = "" if factor < _MIN_CLOCK_FACTOR else f", it plays {factor:.4g} times as {word}"
+        # Ratio of the clocks of film and rows from which it is reported. Source: chosen: 60 and 59.94 Hz are one
+        # rate.
+        pace = "" if factor < 1.02 else f", it plays {factor:.4g} times as {word}"
         return early, f"paired by their time stamps{pace}" if early.by_stamps else ""
     if surplus > 0 and lost_first is None:
         return early, "paired from the first on"
@@ -362,7 +361,8 @@ def _edge_leads(load: _Load, early: FilmPairing, late: FilmPairing) -> np.ndarra
     """By how much depth fits the picture of the early pairing better than that of the late one, for a few rows."""
     both = [shot for shot in load.shots if min(p.picture[shot.row.place] for p in (early, late)) >= 0]
     leads = []
-    for shot in both[:: max(1, len(both) // _N_TRIAL_FRAMES)]:
+    # frames decoded to determine whether the first or last video frames were lost
+    for shot in both[:: max(1, len(both) // 6)]:
         try:
             depth = torch.from_numpy(load.depth(shot))
             pictures = [load.picture(int(p.picture[shot.row.place])).transpose(2, 0, 1) for p in (early, late)]

@@ -46,8 +46,6 @@ _ICL_INTRINSICS = (481.2, 480.0, 319.5, 239.5)
 #: Depth codes of one metre. Source: format definition of TUM RGB-D and ICL-NUIM.
 _UNITS_PER_METRE = 5000.0
 
-#: Stamps of digits alone are frame numbers below this limit; as seconds it is 11 days after 1970. Source: chosen.
-_MAX_FRAME_NUMBER = 1e6
 
 #: Files with fx fy cx cy, or a 3×3 matrix, and distortion.
 _CALIBRATION_FILES = ("calibration.txt", "K.txt", "camera-intrinsics.txt", "intrinsics.txt")
@@ -67,9 +65,6 @@ _FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 #: Files of the format that hold neither cameras nor poses of the camera.
 UNUSED_FILES = ("accelerometer.txt", *_JOINT_TABLES)
-
-#: Largest interval in s between two poses to interpolate in: across longer ones tracking was lost.
-_MAX_POSE_GAP_S = 0.05
 
 
 def recognise(root: Path) -> str | None:
@@ -223,7 +218,8 @@ def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool
         by_stamp.setdefault(float(words[0]), root / picture)
     if not by_stamp:
         raise FormatError(root, f"{kind} frames", "none", f"time-stamped images in {kind}/")
-    is_numbered = all(words[0].isdigit() for _, _, words in rows) and max(by_stamp) < _MAX_FRAME_NUMBER
+    # Stamps of digits alone are frame numbers below this limit; as seconds it is 11 days after 1970. Source: chosen.
+    is_numbered = all(words[0].isdigit() for _, _, words in rows) and max(by_stamp) < 1e6
     return sorted(by_stamp.items()), is_numbered
 
 
@@ -268,7 +264,8 @@ def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float
     weight = (times - a[:, 0]) / np.where(span > 0, span, 1)
     nearest_weight = np.where(weight > 0.5, 1.0, 0.0)
     nearest = np.minimum(np.abs(times - a[:, 0]), np.abs(times - b[:, 0]))
-    interpolated = (weight >= 0) & (weight <= 1) & (span < _MAX_POSE_GAP_S)
+    # Largest interval in s between two poses to interpolate in: across longer ones tracking was lost.
+    interpolated = (weight >= 0) & (weight <= 1) & (span < 0.05)
     covered = interpolated | (nearest < max_difference)
     if not covered.any():
         raise FormatError(file, "time stamps", f"no pose within {max_difference} s of any image", "overlapping clocks")

@@ -31,6 +31,7 @@ def write_azure_kinect(
     frames: Sequence[Frame],
     *,
     T_colour_from_depth: Pose | None = None,
+    T_depth_from_rig: Pose | None = None,
     lost_depth: Sequence[int] = (),
     names: tuple[str, str] = ("COLOR", "DEPTH"),
     depth_codec: str = "rawvideo",
@@ -41,6 +42,7 @@ def write_azure_kinect(
         file: to be written.
         frames: depth has the camera ``depth_camera``, or that of the image.
         T_colour_from_depth: written with both cameras to the attachment ``calibration.json``; None = no attachment.
+        T_depth_from_rig: place of the rig's origin, to which both poses refer; None = the depth camera.
         lost_depth: numbers of frames whose depth is not written.
         names: of the tracks.
         depth_codec: ``rawvideo`` (b16g, as the device's) or ``ffv1``.
@@ -60,7 +62,7 @@ def write_azure_kinect(
         ]
         streams[0].options = {"q:v": "2", "qmin": "1"}
         if T_colour_from_depth is not None:
-            text = json.dumps(_calibration(frames[0], T_colour_from_depth)) + "\0"
+            text = json.dumps(_calibration(frames[0], T_colour_from_depth, T_depth_from_rig)) + "\0"
             container.add_attachment("calibration.json", "application/octet-stream", text.encode())
         for i, frame in enumerate(frames):
             stamp = round((frame_time_s(frame) - frame_time_s(frames[0])) * _TICKS_PER_S)
@@ -96,14 +98,15 @@ def _add_stream(container: Any, codec: str, pixels: str, hw: tuple[int, ...], na
     return stream
 
 
-def _calibration(frame: Frame, T_colour_from_depth: Pose) -> dict[str, Any]:
+def _calibration(frame: Frame, T_colour_from_depth: Pose, T_depth_from_rig: Pose | None) -> dict[str, Any]:
     h, w = frame.hw
     side, left, top = _MODES[tuple(frame.depth.shape[1:])]  # type: ignore[index]
     T = se3.to_matrix(T_colour_from_depth)[0].double().numpy()
+    rig = np.eye(4) if T_depth_from_rig is None else se3.to_matrix(T_depth_from_rig)[0].double().numpy()
     depth_camera = frame.depth_camera or frame.camera
     entries = [
-        _entry("D0", depth_camera, grid=(side, side, left, top), sensor=(1024, 1024), T=np.eye(4)),
-        _entry("PV0", frame.camera, grid=(w, w * 3 // 4, 0, (w * 3 // 4 - h) // 2), sensor=(3072, 4096), T=T),
+        _entry("D0", depth_camera, grid=(side, side, left, top), sensor=(1024, 1024), T=rig),
+        _entry("PV0", frame.camera, grid=(w, w * 3 // 4, 0, (w * 3 // 4 - h) // 2), sensor=(3072, 4096), T=T @ rig),
     ]
     return {"CalibrationInformation": {"Cameras": entries}}
 

@@ -6,13 +6,11 @@ units and axes.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from dhtorch.export.arrays import (
     K_matrix,
@@ -20,18 +18,17 @@ from dhtorch.export.arrays import (
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
-    rotation_to_xyzw,
 )
 from dhtorch.records import Camera, Frame
 from support.writers.parts import (
+    encode_jpeg,
     encode_unfiltered_png,
     format_row,
     format_rows,
+    pose_row,
     save_file,
+    save_rgbd,
 )
-
-#: Quality of JPEG images, nearly lossless. Origin not recorded.
-_JPEG_QUALITY = 97
 
 #: Depth codes of one metre in ScanNet, 3RScan, Open3D and SUN3D: millimetres. Source: format definitions.
 _CODES_PER_METRE_MM = 1000.0
@@ -56,9 +53,7 @@ def write_bop(root: Path, frames: Sequence[Frame], *, depth_scale: float = 0.1, 
     """
     entries = {}
     for i, frame in enumerate(frames):
-        save_file(root / "rgb" / f"{i:06d}.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        code = encode_depth_codes(frame.depth, _CODES_PER_METRE_MM / depth_scale)
-        save_file(root / "depth" / f"{i:06d}.png", encode_unfiltered_png(code))
+        save_rgbd(root, frame, f"rgb/{i:06d}.png", f"depth/{i:06d}.png", _CODES_PER_METRE_MM / depth_scale)
         entry = {"cam_K": K_matrix(frame.camera).ravel().tolist(), "depth_scale": depth_scale}
         if poses:
             w2c = np.linalg.inv(pose_matrix(frame))
@@ -67,19 +62,15 @@ def write_bop(root: Path, frames: Sequence[Frame], *, depth_scale: float = 0.1, 
     save_file(root / "scene_camera.json", json.dumps(entries, indent=1))
 
 
-def write_replica(root: Path, frames: Sequence[Frame], *, parameters_above: bool = False) -> None:
-    """Write a Replica scene as NICE-SLAM renders it: ``results/``, ``traj.txt`` and ``cam_params.json``.
-
-    ``parameters_above``: ``cam_params.json`` in the folder above the scene, as in the published archive.
-    """
+def write_replica(root: Path, frames: Sequence[Frame]) -> None:
+    """Write a Replica scene as NICE-SLAM renders it: ``results/``, ``traj.txt`` and ``cam_params.json``."""
     for i, frame in enumerate(frames):
-        save_file(root / "results" / f"frame{i:06d}.jpg", _encode_jpeg(frame))
-        code = encode_depth_codes(frame.depth, _REPLICA_CODES_PER_METRE)
-        save_file(root / "results" / f"depth{i:06d}.png", encode_unfiltered_png(code))
+        save_rgbd(root, frame, f"results/frame{i:06d}.jpg", f"results/depth{i:06d}.png", _REPLICA_CODES_PER_METRE)
     save_file(root / "traj.txt", "".join(format_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
-    camera = _named_intrinsics(frames[0])
+    K, (h, w) = K_matrix(frames[0].camera), frames[0].hw
+    camera = {"w": w, "h": h, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     parameters = {"camera": {**camera, "scale": _REPLICA_CODES_PER_METRE}}
-    save_file((root.parent if parameters_above else root) / "cam_params.json", json.dumps(parameters))
+    save_file(root / "cam_params.json", json.dumps(parameters))
 
 
 def write_scannet(root: Path, frames: Sequence[Frame], *, lost: Sequence[int] = ()) -> None:
@@ -88,9 +79,7 @@ def write_scannet(root: Path, frames: Sequence[Frame], *, lost: Sequence[int] = 
     ``lost``: numbers of the frames whose pose is −inf, as where tracking failed.
     """
     for i, frame in enumerate(frames):
-        save_file(root / "color" / f"{i}.jpg", _encode_jpeg(frame))
-        code = encode_depth_codes(frame.depth, _CODES_PER_METRE_MM)
-        save_file(root / "depth" / f"{i}.png", encode_unfiltered_png(code))
+        save_rgbd(root, frame, f"color/{i}.jpg", f"depth/{i}.png", _CODES_PER_METRE_MM)
         pose = np.full((4, 4), -np.inf) if i in lost else pose_matrix(frame)
         save_file(root / "pose" / f"{i}.txt", format_rows(pose))
     for kind, camera in (("color", frames[0].camera), ("depth", frames[0].map_camera)):
@@ -111,8 +100,9 @@ def write_sens_folder(root: Path, frames: Sequence[Frame], *, pgm: bool = True, 
     (h, w), (depth_h, depth_w) = first.hw, first.depth.shape[-2:]
     for i, frame in enumerate(frames):
         code = encode_depth_codes(frame.depth, _CODES_PER_METRE_MM)
-        picture = _encode_pgm(code) if pgm else encode_unfiltered_png(code)
-        save_file(root / f"frame-{i:06d}.color.jpg", _encode_jpeg(frame))
+        head = f"P5\n{code.shape[1]} {code.shape[0]}\n65535\n".encode()
+        picture = head + code.astype(">u2").tobytes() if pgm else encode_unfiltered_png(code)
+        save_file(root / f"frame-{i:06d}.color.jpg", encode_jpeg(frame_to_hwc(frame), 97))
         save_file(root / f"frame-{i:06d}.depth.{'pgm' if pgm else 'png'}", picture)
         pose = np.full((4, 4), -np.inf) if i in lost else pose_matrix(frame)
         save_file(root / f"frame-{i:06d}.pose.txt", format_rows(pose))
@@ -142,9 +132,7 @@ def write_open3d(
     """
     blocks = []
     for i, frame in enumerate(frames):
-        save_file(root / "color" / f"{i:05d}.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        code = encode_depth_codes(frame.depth, _CODES_PER_METRE_MM)
-        save_file(root / "depth" / f"{i:05d}.png", encode_unfiltered_png(code))
+        save_rgbd(root, frame, f"color/{i:05d}.png", f"depth/{i:05d}.png", _CODES_PER_METRE_MM)
         blocks.append(f"{i} {i} {i + 1}\n" + format_rows(pose_matrix(frame)))
     save_file(root / trajectory, "".join(blocks))
     h, w = frames[0].hw
@@ -176,12 +164,9 @@ def write_icl_nuim(
     """
     rows, poses = [], []
     for i, frame in enumerate(frames):
-        save_file(root / "rgb" / f"{i}.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        code = encode_depth_codes(frame.depth, _TUM_CODES_PER_METRE)
-        save_file(root / "depth" / f"{i}.png", encode_unfiltered_png(code))
+        save_rgbd(root, frame, f"rgb/{i}.png", f"depth/{i}.png", _TUM_CODES_PER_METRE)
         rows.append(f"{i} depth/{i}.png {i} rgb/{i}.png")
-        pose = _FLIP_Y @ pose_matrix(frame) @ _FLIP_Y
-        poses.append(f"{i} " + format_row([*pose[:3, 3], *rotation_to_xyzw(pose[:3, :3])]))
+        poses.append(f"{i} " + pose_row(frame, _FLIP_Y @ pose_matrix(frame) @ _FLIP_Y))
     save_file(root / "associations.txt", "\n".join(rows) + "\n")
     if calibration:
         K = K_matrix(frames[0].camera)
@@ -194,35 +179,17 @@ def write_ros_tum(root: Path, frames: Sequence[Frame], *, units_per_metre: float
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for frame in frames:
         stamp = f"{frame_time_s(frame):.6f}"
-        pose = pose_matrix(frame)
-        code = encode_depth_codes(frame.depth, units_per_metre)
-        for kind, picture in (("rgb", frame_to_hwc(frame)), ("depth", code)):
-            save_file(root / kind / f"{stamp}.png", encode_unfiltered_png(picture))
-            lists[kind].append(f"{stamp} {kind}/{stamp}.png")
-        lists["groundtruth"].append(f"{stamp} {format_row([*pose[:3, 3], *rotation_to_xyzw(pose[:3, :3])])}")
+        save_rgbd(root, frame, f"rgb/{stamp}.png", f"depth/{stamp}.png", units_per_metre)
+        lines = (f"{stamp} rgb/{stamp}.png", f"{stamp} depth/{stamp}.png", f"{stamp} {pose_row(frame)}")
+        for column, line in zip(lists.values(), lines, strict=True):
+            column.append(line)
     for name, lines in lists.items():
         save_file(root / f"{name}.txt", "\n".join(lines) + "\n")
     K = K_matrix(frames[0].camera)
     save_file(root / "calibration.txt", format_row([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) + "\n")
 
 
-def _encode_jpeg(frame: Frame) -> bytes:
-    out = io.BytesIO()
-    Image.fromarray(frame_to_hwc(frame)).save(out, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
-    return out.getvalue()
-
-
-def _encode_pgm(code: np.ndarray) -> bytes:
-    """(h, w) uint16 → bytes of a binary grey map."""
-    return f"P5\n{code.shape[1]} {code.shape[0]}\n65535\n".encode() + code.astype(">u2").tobytes()
-
-
 def _K_4x4(camera: Camera) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = K_matrix(camera)
     return matrix
-
-
-def _named_intrinsics(frame: Frame) -> dict[str, float]:
-    K, (h, w) = K_matrix(frame.camera), frame.hw
-    return {"w": w, "h": h, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

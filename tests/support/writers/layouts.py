@@ -13,7 +13,6 @@ import torch
 
 from dhtorch.export.arrays import (
     K_matrix,
-    encode_depth_codes,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
@@ -22,12 +21,7 @@ from dhtorch.export.arrays import (
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from support.writers.parts import (
-    encode_unfiltered_png,
-    format_row,
-    format_rows,
-    save_file,
-)
+from support.writers.parts import encode_unfiltered_png, format_row, format_rows, pose_row, save_file, save_rgbd
 
 #: Lag in s of the depth stamps behind the colour stamps: TUM's streams are not synchronous.
 _TUM_DEPTH_LAG_S = 0.0125
@@ -47,12 +41,11 @@ def write_tum(
     poses.append("# timestamp tx ty tz qx qy qz qw")
     for frame in frames:
         time = frame_time_s(frame)
-        for kind, stamp in (("rgb", f"{time:.6f}"), ("depth", f"{time + _TUM_DEPTH_LAG_S:.6f}")):
-            lists[kind].append(f"{stamp} {kind}/{stamp}.png")
-            picture = frame_to_hwc(frame) if kind == "rgb" else encode_depth_codes(frame.depth, units_per_metre)
-            save_file(root / kind / f"{stamp}.png", encode_unfiltered_png(picture))
-        pose = pose_matrix(frame)
-        poses.append(f"{time:.6f} " + format_row([*pose[:3, 3], *rotation_to_xyzw(pose[:3, :3])]))
+        late = time + _TUM_DEPTH_LAG_S
+        save_rgbd(root, frame, f"rgb/{time:.6f}.png", f"depth/{late:.6f}.png", units_per_metre)
+        lists["rgb"].append(f"{time:.6f} rgb/{time:.6f}.png")
+        lists["depth"].append(f"{late:.6f} depth/{late:.6f}.png")
+        poses.append(f"{time:.6f} {pose_row(frame)}")
     for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
         save_file(root / f"{name}.txt", "\n".join(lines) + "\n")
     if camera is None:
@@ -75,10 +68,7 @@ def write_named_frames(
     if frames[0].depth_camera is not None:
         meta |= {"K": K_matrix(frames[0].camera).tolist(), "K_depth": K_matrix(frames[0].depth_camera).tolist()}
     for i, frame in enumerate(frames):
-        save_file(root / f"frame-{i:06d}.color.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        save_file(
-            root / f"frame-{i:06d}.depth.png", encode_unfiltered_png(encode_depth_codes(frame.depth, units_per_metre))
-        )
+        save_rgbd(root, frame, f"frame-{i:06d}.color.png", f"frame-{i:06d}.depth.png", units_per_metre)
         save_file(root / f"frame-{i:06d}.pose.txt", format_rows(pose_matrix(frame)))
     save_file(root / "camera-intrinsics.txt", format_rows(K_matrix(frames[0].depth_camera or frames[0].camera)))
     if meta:
@@ -88,10 +78,7 @@ def write_named_frames(
 def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0) -> None:
     """``images/``, ``depth/``, ``poses.txt`` (one row-major matrix per line) and ``K.txt``."""
     for i, frame in enumerate(frames):
-        save_file(root / "images" / f"{i:05d}.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        save_file(
-            root / "depth" / f"{i:05d}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, units_per_metre))
-        )
+        save_rgbd(root, frame, f"images/{i:05d}.png", f"depth/{i:05d}.png", units_per_metre)
     save_file(root / "poses.txt", "".join(format_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
     save_file(root / "K.txt", format_rows(K_matrix(frames[0].camera)))
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
+
+from dhtorch.export.arrays import encode_depth_codes, frame_to_hwc, pose_matrix, rotation_to_xyzw
+from dhtorch.records import Frame
 
 
 def encode_unfiltered_png(picture: np.ndarray) -> bytes:
@@ -36,3 +41,23 @@ def save_file(file: Path, content: bytes | str) -> None:
     """Write a file and create its folder."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def encode_jpeg(picture: np.ndarray, quality: int) -> bytes:
+    """(H, W, 3) uint8 → bytes of a JPEG without chroma subsampling."""
+    out = io.BytesIO()
+    Image.fromarray(picture).save(out, "JPEG", quality=quality, subsampling=0)
+    return out.getvalue()
+
+
+def save_rgbd(root: Path, frame: Frame, image: str, depth: str, units_per_metre: float) -> None:
+    """Write a frame's image (PNG, or nearly lossless JPEG by its name) and its depth codes (PNG)."""
+    picture = frame_to_hwc(frame)
+    save_file(root / image, encode_jpeg(picture, 97) if image.endswith(".jpg") else encode_unfiltered_png(picture))
+    save_file(root / depth, encode_unfiltered_png(encode_depth_codes(frame.depth, units_per_metre)))
+
+
+def pose_row(frame: Frame, pose: np.ndarray | None = None) -> str:
+    """Translation and quaternion x y z w of a pose, by default the frame's, as one line of text."""
+    T = pose_matrix(frame) if pose is None else pose
+    return format_row([*T[:3, 3], *rotation_to_xyzw(T[:3, :3])])

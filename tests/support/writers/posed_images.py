@@ -18,7 +18,7 @@ from dhtorch.export.arrays import (
     rotation_to_xyzw,
 )
 from dhtorch.records import Frame
-from support.writers.parts import encode_unfiltered_png, format_row, save_file
+from support.writers.parts import encode_unfiltered_png, format_row, save_file, save_rgbd
 
 #: Change of camera axes from OpenCV (y down, z forward) to OpenGL (y up, z backward).
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -72,8 +72,7 @@ def write_nerfstudio(
         entry = {"file_path": f"./images/{name}{suffix}", depth_key: f"./depth/{name}.png"}
         entry |= {"transform_matrix": c2w.tolist()} | ({} if shared_K else _nerfstudio_camera(frame))
         about["frames"].append(entry | ({"timestamp": frame_time_s(frame)} if times else {}))
-        save_file(root / "images" / f"{name}.png", encode_unfiltered_png(frame_to_hwc(frame)))
-        save_file(root / "depth" / f"{name}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, 1 / unit_m)))
+        save_rgbd(root, frame, f"images/{name}.png", f"depth/{name}.png", 1 / unit_m)
     save_file(root / "transforms.json", json.dumps(about))
 
 
@@ -131,8 +130,7 @@ def write_colmap_capture(
         x, y, z, w = rotation_to_xyzw(w2c[:3, :3])
         images += [f"{i} {format_row([w, x, y, z, *w2c[:3, 3]])} {i} {name}", "12.5 7.25 -1" if i % 2 else ""]
         times.append(f"{i} {format_row([frame_time_s(frame)])}")
-        save_file(root / "images" / name, encode_unfiltered_png(frame_to_hwc(frame)))
-        save_file(root / "depth" / name, encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)))
+        save_rgbd(root, frame, f"images/{name}", f"depth/{name}", 1000)
     head = ["# Image list with two lines of data per image", *(["# metres"] if is_metric else [])]
     texts = {"cameras": ["# Camera list", *cameras], "images": [*head, *images], "points3D": ["# 3D point list"]}
     for kind, lines in (texts | ({"times": times} if is_metric else {})).items():

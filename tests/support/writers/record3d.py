@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export.arrays import (
@@ -27,7 +26,7 @@ from dhtorch.export.arrays import (
 from dhtorch.export.stray import ARKIT_UP, turn_world
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
-from support.writers.parts import save_file
+from support.writers.parts import encode_jpeg, save_file
 from support.writers.video import write_video
 
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
@@ -63,9 +62,9 @@ def write_r3d(
     pack = import_optional("lzfse", "liblzfse").compress
     with zipfile.ZipFile(file, "w", compression) as archive:
         archive.writestr("metadata", json.dumps(meta))
-        archive.writestr("icon", _encode_jpeg(frame_to_hwc(frames[0])[:16, :16]))
+        archive.writestr("icon", encode_jpeg(frame_to_hwc(frames[0])[:16, :16], 95))
         for i, frame in enumerate(frames):
-            archive.writestr(f"rgbd/{i}.jpg", _encode_jpeg(frame_to_hwc(frame)))
+            archive.writestr(f"rgbd/{i}.jpg", encode_jpeg(frame_to_hwc(frame), 95))
             archive.writestr(f"rgbd/{i}.depth", pack(frame.depth[0].numpy().astype("<f4").tobytes()))
             if frame.conf is not None:
                 archive.writestr(f"rgbd/{i}.conf", pack(frame.conf[0].numpy().astype(np.uint8).tobytes()))
@@ -83,7 +82,7 @@ def write_record3d_exr(
     exr = import_optional("OpenEXR")
     folder = root / "EXR_RGBD"
     for i, frame in enumerate(frames):
-        save_file(folder / "rgb" / f"{i}.jpg", _encode_jpeg(frame_to_hwc(frame)))
+        save_file(folder / "rgb" / f"{i}.jpg", encode_jpeg(frame_to_hwc(frame), 95))
         header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         picture = io.BytesIO()
         # The library ignores strides: arrays must be contiguous.
@@ -146,12 +145,6 @@ def _arkit_pose(frame: Frame) -> list[float]:
         return _NO_POSE
     c2w = pose_matrix(turn_world(frame, ARKIT_UP)) @ np.diag([1.0, -1.0, -1.0, 1.0])
     return [*map(float, rotation_to_xyzw(c2w[:3, :3])), *map(float, c2w[:3, 3])]
-
-
-def _encode_jpeg(picture: np.ndarray) -> bytes:
-    out = io.BytesIO()
-    Image.fromarray(picture).save(out, "JPEG", quality=95, subsampling=0)
-    return out.getvalue()
 
 
 def _hue_to_rgb(hue: np.ndarray) -> np.ndarray:
