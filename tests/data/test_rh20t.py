@@ -8,10 +8,12 @@ import pickle
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from support.capture_cases import DELETE, Case, check_case
 from support.rh20t_frames import BASE, CAMERA, FIXED, HAND, HW, moving, still
 
 pytest.importorskip("av")
@@ -19,7 +21,6 @@ pytest.importorskip("av")
 from support.box_scene import off_wall, pose, render, world_points
 
 from dhtorch import data
-from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t, rh20t_robot, rh20t_set
@@ -93,18 +94,6 @@ def test_a_hand_camera_taken_for_a_fixed_one_is_wrong(tmp_path: Path) -> None:
     assert float(off_wall(world_points(recording[1])).median()) > 0.05
 
 
-def test_K_of_the_full_size_follows_the_exact_rule(tmp_path: Path) -> None:
-    root = scene(tmp_path)
-    file = next(tmp_path.glob("calib/*/intrinsics.npy"))
-    K = np.array([[900.0, 0, 639.5, 0], [0, 900, 359.5, 0], [0, 0, 1, 0]])
-    np.save(file, {FIXED: K, HAND: K[:, :3]}, allow_pickle=True)
-    for recording in data.open_all(root):
-        # A centre stays a centre; the plain rule would put it half a pixel off.
-        assert recording[0].camera.c.tolist() == [[31.5, 17.5]] and recording[0].camera.f.tolist() == [[45, 45]]
-    with pytest.raises(FormatError, match=r"intrinsics.npy: image size: found 64x36, expected the shape of 640x480"):
-        data.open(root, serials=[HAND], calibrated_hw=(480, 640))
-
-
 def test_low_bytes_lie_above_high_bytes(tmp_path: Path) -> None:
     """Codes around the wrap of the low byte: swapped planes would give 0.001 m steps of 256."""
     frame = still(1)[0]
@@ -125,39 +114,6 @@ def test_depth_in_a_parallel_tree_at_half_the_size(tmp_path: Path) -> None:
     write_lossless(beside / f"cam_{FIXED}" / "depth.mp4", [x[:, :30] for x in small], "yuvj420p")
     with pytest.raises(FormatError, match=r"depth.mp4: size: found 30x36"):
         data.open(root, serials=[FIXED], depth_root=str(beside))
-
-
-def test_missing_depth_is_empty_and_reported(tmp_path: Path) -> None:
-    recording = data.open(scene(tmp_path, depth=False), serials=[FIXED])
-    assert recording.report == (f"camera {FIXED}: no depth.mp4: depth is empty",)
-    assert not recording[0].depth.any() and torch.equal(recording[0].image, still()[0].image)
-
-
-def test_depth_is_paired_by_time(tmp_path: Path) -> None:
-    root = scene(tmp_path, lag=0.015)
-    assert len(data.open(root, serials=[FIXED])) == 3
-    assert len(data.open(root, serials=[FIXED], max_difference=0.016)) == 3
-    with pytest.raises(FormatError, match=r"no depth within 0.01 s of any image"):
-        data.open(root, serials=[FIXED], max_difference=0.01)
-    file = root / f"cam_{FIXED}" / "timestamps.npy"
-    stamps = read_npy(file)
-    stamps["depth"][1] += 40  # nobody's source view now
-    np.save(file, stamps, allow_pickle=True)
-    recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 image without depth within 0.02 s" in recording.report[0]
-    torch.testing.assert_close(recording[1].depth, still()[2].depth, atol=1e-3, rtol=0)
-
-
-def test_stamps_that_do_not_fit_the_video_are_reported(tmp_path: Path) -> None:
-    root = scene(tmp_path, depth=False)
-    file = root / f"cam_{FIXED}" / "timestamps.npy"
-    stamps = read_npy(file)["color"]
-    np.save(file, {"color": [*stamps, stamps[-1] + 100], "depth": []}, allow_pickle=True)
-    recording = data.open(root, serials=[FIXED])
-    assert len(recording) == 3 and "4 color stamps for 3 frames" in recording.report[1]
-    np.save(file, {"color": [stamps[0], stamps[0], stamps[2]], "depth": []}, allow_pickle=True)
-    recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 color frame with a time stamp not later" in recording.report[1]
 
 
 def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
@@ -264,19 +220,6 @@ def test_gaps_are_not_bridged() -> None:
     assert one.at(np.array([4.0, 5.0, 6.0]))[1].tolist() == [False, True, False]
 
 
-def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
-    root = scene(tmp_path)
-    file = root / "transformed" / "tcp_base.npy"
-    entries = read_npy(file)
-    np.save(file, {s: e[:2] for s, e in entries.items()}, allow_pickle=True)
-    recording = data.open(root, serials=[HAND])
-    assert recording.number.tolist() == [0, 1] and "1 frame in a gap of the tcp stream" in recording.report[0]
-    same_scene(recording, moving()[:2])
-    file.unlink()
-    recording = data.open(root, serials=[HAND])
-    assert recording.poses is None and "without tcp_base.npy: no poses" in recording.report[0]
-
-
 @pytest.mark.parametrize("configuration", [1, 3, 5, 6])
 def test_calibration_tcp_in_the_robots_notation(tmp_path: Path, configuration: int) -> None:
     arm = ROBOT_ARMS[configuration]
@@ -292,42 +235,80 @@ def test_calibration_tcp_in_the_robots_notation(tmp_path: Path, configuration: i
 # ---------------------------------------------------------------------------------------------------------- bad input
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    root = scene(tmp_path)
-    with pytest.raises(FormatError, match=r"option serials: found 7, expected some of 043322070878, 750612070851"):
-        data.open_all(root, serials=["7"])
-    with pytest.raises(FormatError, match=r"option configuration: found 9, expected 1 to 7"):
-        data.open_all(root, configuration=9)
-    (root / f"cam_{HAND}" / "color.mp4").unlink()
-    (recording,) = data.open_all(root)
-    assert recording.report == (f"camera {HAND}: no color.mp4: left out",)
-    with pytest.raises(FormatError, match=r"color.mp4"):
-        data.open(root, serials=[HAND])
-    meta = json.loads((root / "metadata.json").read_text())
-    (root / "metadata.json").write_text(json.dumps({**meta, "bad_calib_view": [FIXED]}))
-    assert data.open(root).report[1] == f"camera {FIXED}: calibration marked as bad in the metadata"
-    for value in (-1, "../../x", None, 1.5):
-        (root / "metadata.json").write_text(json.dumps({"calib": value}))
-        with pytest.raises(FormatError, match=r"metadata.json: calib"):
-            data.open(root)
-    (root / "metadata.json").write_text("{}")
-    with pytest.raises(FormatError, match=r"metadata.json: calib: found -1, expected .*-1 = none"):
-        data.open(root)
+def write_scene(root: Path, _frames: list[Frame], *, name: str = "scene_cfg_0001", **options: Any) -> None:
+    """A scene with a fixed camera and one on the hand."""
+    scene(root, **options).rename(root / name)
+
+
+def rh20t_case(name: str, edits: Any = (), expect: Any = None, *, serial: str | None = FIXED, **more: Any) -> Case:
+    path = more.setdefault("written", {}).get("name", "scene_cfg_0001")
+    options = ({} if serial is None else {"serials": [serial]}) | more.pop("options", {})
+    frames = moving if serial == HAND else still
+    return Case(name, write_scene, frames, edits, expect or {}, path=path, options=options, **more)
+
+
+def stamps_with(**change: Any) -> tuple[str, Any]:
+    """An edit of the time stamps of the fixed camera."""
+    return f"{SCENE}/cam_{FIXED}/timestamps.npy", lambda stamps: {
+        kind: change[kind](list(values)) if kind in change else values for kind, values in stamps.items()
+    }
+
+
+SCENE = "scene_cfg_0001"
+META, TCP = f"{SCENE}/metadata.json", f"{SCENE}/transformed/tcp_base.npy"
+FULL_K = np.array([[900.0, 0, 639.5, 0], [0, 900, 359.5, 0], [0, 0, 1, 0]])
+K_FILE = ("calib/*/intrinsics.npy", lambda _: {FIXED: FULL_K, HAND: FULL_K[:, :3]})
+NO_DEPTH = f"camera {FIXED}: no depth.mp4: depth is empty"
+STANDS = "^unknown configuration: every camera is assumed stationary"
+
+CASES = [
+    # A centre stays a centre; the plain rule would put it half a pixel off.
+    *(rh20t_case(f"K of the full size, {serial}", [K_FILE], {"c": [31.5, 17.5], "f": [45, 45]}, serial=serial)
+      for serial in (FIXED, HAND)),
+    rh20t_case("K of another shape", [K_FILE], options={"calibrated_hw": (480, 640)},
+               error=r"intrinsics.npy: image size: found 64x36, expected the shape of 640x480"),
+    rh20t_case("no depth", (), {"empty": [True] * 3, "report": (NO_DEPTH,), "unit": None}, written={"depth": False}),
+    *(rh20t_case(f"depth 15 ms later, {options}", (), {"number": [0, 1, 2], "same": ([0, 1, 2], 1e-3)},
+                 written={"lag": 0.015}, options=options) for options in ({}, {"max_difference": 0.016})),
+    rh20t_case("depth too late", written={"lag": 0.015}, options={"max_difference": 0.01},
+               error=r"no depth within 0.01 s of any image"),
+    rh20t_case("one depth too late", [stamps_with(depth=lambda t: [t[0], t[1] + 40, t[2]])],
+               {"number": [0, 2], "same": ([0, 2], 1e-3), "report": ["1 image without depth within 0.02 s"]}),
+    rh20t_case("a stamp too many", [stamps_with(color=lambda t: [*t, t[-1] + 100])],
+               {"number": [0, 1, 2], "report": ["", "4 color stamps for 3 frames"]}, written={"depth": False}),
+    rh20t_case("a stamp twice", [stamps_with(color=lambda t: [t[0], t[0], t[2]])],
+               {"number": [0, 2], "report": ["", "1 color frame with a time stamp not later"]}, written={"depth": False}),
+    rh20t_case("a gap of the tcp", [(TCP, lambda entries: {s: e[:2] for s, e in entries.items()})],
+               {"number": [0, 1], "same": ([0, 1], 1e-3), "report": ["1 frame in a gap of the tcp stream"]}, serial=HAND),
+    rh20t_case("no tcp", [(TCP, DELETE)], {"posed": False, "report": ["without tcp_base.npy: no poses"]}, serial=HAND),
+    rh20t_case("no such camera", serial="7", error=r"option serials: found 7, expected some of 043322070878, 75061207"),
+    rh20t_case("no such robot", options={"configuration": 9}, error=r"option configuration: found 9, expected 1 to 7"),
+    rh20t_case("no images", [(f"{SCENE}/cam_{HAND}/color.mp4", DELETE)], serial=HAND, error=r"color.mp4"),
+    rh20t_case("one camera without images, marked as bad",
+               [(f"{SCENE}/cam_{HAND}/color.mp4", DELETE), (META, {"bad_calib_view": [FIXED]})],
+               {"report": (f"camera {HAND}: no color.mp4: left out",
+                           f"camera {FIXED}: calibration marked as bad in the metadata")}, serial=None),
+    *(rh20t_case(f"calibration {value}", [(META, json.dumps({"calib": value}))], serial=None,
+                 error=r"metadata.json: calib") for value in (-1, "../../x", None, 1.5)),
+    rh20t_case("no calibration", [(META, "{}")], serial=None,
+               error=r"metadata.json: calib: found -1, expected .*-1 = none"),
+    rh20t_case("calibrations elsewhere", [("calib", Path("elsewhere"))], serial=None,
+               error=r"intrinsics.npy: file: found no such file"),
+    rh20t_case("no configuration", (), {"report": [STANDS], "same": ([0, 1, 2], 1e-3)}, written={"name": "scene"}),
+    rh20t_case("configuration by option", (), {"report": (), "same": ([0, 1, 2], 1e-3)}, serial=HAND,
+               written={"name": "scene"}, options={"configuration": 1}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
 
 
 def test_calibrations_elsewhere(tmp_path: Path) -> None:
     root = scene(tmp_path / "a")
     shutil.move(tmp_path / "a" / "calib", tmp_path / "calibrations")
-    with pytest.raises(FormatError, match=r"intrinsics.npy: file: found no such file"):
-        data.open_all(root)
     assert len(data.open_all(root, calibration=str(tmp_path / "calibrations"))) == 2
-
-
-def test_folder_without_a_configuration_is_taken_to_stand_still(tmp_path: Path) -> None:
-    root = scene(tmp_path).rename(tmp_path / "scene")
-    recording = data.open(root, serials=[FIXED])
-    assert "unknown configuration" in recording.report[0]
-    same_scene(data.open(root, serials=[HAND], configuration=1), moving())
 
 
 def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):

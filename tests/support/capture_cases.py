@@ -16,6 +16,7 @@ import torch
 from pyarrow import parquet
 
 from dhtorch import data
+from dhtorch.data.codecs import pickles
 from dhtorch.data.recording import Recording
 from dhtorch.records import Frame
 from support.box_scene import off_wall, own_camera, turned_back, walk, world_points
@@ -30,7 +31,7 @@ def edit_files(root: Path, edits: Sequence[Edit]) -> None:
     """Edit files in turn; a name is a path below ``root`` or a pattern of existing ones.
 
     The change is DELETE; the new content (text, bytes, codes or an image as array); another name (a ``Path``); pairs
-    (old text, new text); entries that are put into a JSON document, at any depth; or a function of the text (of the table, for Parquet).
+    (old text, new text); entries that are put into a JSON document, at any depth; or a function of the text (of the table or value, for Parquet and ``.npy``).
     """
     for name, change in edits:
         for file in sorted(root.glob(name)) or [root / name]:
@@ -47,6 +48,8 @@ def edit_files(root: Path, edits: Sequence[Edit]) -> None:
                 file.write_text(json.dumps(merge(json.loads(file.read_text()), change)))
             elif callable(change) and file.suffix == ".parquet":
                 parquet.write_table(change(parquet.read_table(file)), file, row_group_size=3)
+            elif callable(change) and file.suffix == ".npy":
+                np.save(file, change(pickles.read_npy(file)), allow_pickle=True)
             elif callable(change):
                 file.write_text(change(file.read_text()))
             else:
