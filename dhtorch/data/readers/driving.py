@@ -107,7 +107,12 @@ def _load_frame(
     shot, camera = shots[i], cameras[i]
     image = torch.from_numpy(files.read_image(root / shot.image, shot.hw))
     T = se3.relative(T_world_from_lidar[i : i + 1], T_world_from_cam[i : i + 1])
-    xyz = se3.apply(T, torch.from_numpy(_read_sweep(root / shot.sweep, shot.fields))[None])
+    file, fields = root / shot.sweep, shot.fields
+    data = npy.read_npz(file, "data")
+    if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
+        raise FormatError(file, "data", f"shape {data.shape}", f"points with columns {', '.join(fields)}")
+    points = np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)
+    xyz = se3.apply(T, torch.from_numpy(points)[None])
     depth = convert.splat_depth(xyz[0], camera, shot.hw, hide_px)
     rows = shot.hw[0] - round(crop_bottom * shot.hw[0])
     return Frame(image[None, :, :rows].contiguous(), depth[None, :rows].contiguous(), camera)
@@ -210,14 +215,6 @@ def _read_camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
     entry = intrinsics[names.index(name)]
     fx, fy, cx, cy, skew = (files.get_entry(entry, key, (int, float), file) for key in ("fx", "fy", "cx", "cy", "skew"))
     return convert.to_camera([[fx, skew, cx], [0, fy, cy], [0, 0, 1]], hw, file, f"{name} intrinsics")
-
-
-def _read_sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
-    """Points (M, 3) m in the LiDAR's frame."""
-    data = npy.read_npz(file, "data")
-    if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
-        raise FormatError(file, "data", f"shape {data.shape}", f"points with columns {', '.join(fields)}")
-    return np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)
 
 
 def _check_relative_path(name: str, scene: Path) -> str:

@@ -16,8 +16,9 @@ Depth is ``f · baseline / (disparity + doffs)`` with ``doffs`` the difference o
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -69,30 +70,26 @@ def read(root: str | Path) -> list[Recording]:
     root = Path(root)
     report: tuple[str, ...] = ()
     if (root / "calib.txt").is_file():
-        file = root / "calib.txt"
-        entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
-        images = (root / "im0.png", root / "im1.png")
-        hw = files.read_image_header(images[0]).hw
-        size = (_parse_number(entries, "height", file), _parse_number(entries, "width", file))
-        if size != hw:
-            raise FormatError(file, "width and height", f"{size[1]:g}x{size[0]:g}", f"{hw[1]}x{hw[0]}, as im0.png")
-        first, second = (_find_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
-        if first is None:
-            raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
-        cameras = [convert.to_camera(_parse_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
-        baseline, doffs = _parse_number(entries, "baseline", file) / 1000, _parse_number(entries, "doffs", file)
-        pair = _check_pair(_LoadPair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
+        file, pair = _read_calib_pair(root)
     elif (root / "dmin.txt").is_file():
-        pair, report = _read_views_pair(root), (_VIEWS_ASSUMPTION,)
+        (file, pair), report = _read_views_pair(root), (_VIEWS_ASSUMPTION,)
     else:
-        pair = _read_npz_pair(root)
+        file, pair = _read_npz_pair(root)
+    if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
+        raise FormatError(file, "baseline", pair.baseline, "a positive length")
+    left, right = pair.cameras
+    if not torch.equal(left.f, right.f):
+        raise FormatError(file, "focal length", f"{left.f.tolist()} and {right.f.tolist()}", "equal ones")
+    shift = float(right.c[0, 0] - left.c[0, 0])
+    if abs(shift - pair.doffs) > 0.5:
+        raise FormatError(file, "doffs", pair.doffs, f"{shift:g}, the difference of the principal points")
     eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).clone()
     t = torch.tensor([[0.0, 0.0, 0.0], [pair.baseline, 0.0, 0.0]], dtype=torch.float64)
     return [
         Recording(
             name=root.resolve().name,
             format="rectified",
-            load=pair,
+            load=partial(_load_view, pair=pair),
             number=consecutive_frame_numbers(2),
             root=root,
             poses=Pose(eye, t),
@@ -101,9 +98,8 @@ def read(root: str | Path) -> list[Recording]:
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class _LoadPair:
-    """0 → left frame, 1 → right frame."""
+class _Pair(NamedTuple):
+    """The left and the right view."""
 
     images: tuple[Path, Path]
     disparities: tuple[Path | None, Path | None]
@@ -113,22 +109,43 @@ class _LoadPair:
     doffs: float  # px
     codes_per_px: float = 1.0  # of the disparity maps; codes of 0 are then unknown
 
-    def __call__(self, i: int) -> Frame:
-        image = torch.from_numpy(files.read_image(self.images[i], self.hw))
-        camera, file = self.cameras[i], self.disparities[i]
-        depth = np.zeros(self.hw, np.float32)
-        if file is not None:
-            code = _read_disparity(file, self.hw)
-            disparity = code.astype(np.float64) / self.codes_per_px + self.doffs
-            is_known = code > 0 if file.suffix == ".png" else np.isfinite(disparity)
-            # Disparities in px (with ``doffs``) up to this value give no depth: they are too small to be measured.
-            usable = is_known & (disparity > 1e-3)
-            f = camera.f[0, 0].double().item()
-            depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
-        return Frame(image[None], torch.from_numpy(depth)[None], camera)
+
+def _load_view(i: int, *, pair: _Pair) -> Frame:
+    """0 → left frame, 1 → right frame."""
+    image = torch.from_numpy(files.read_image(pair.images[i], pair.hw))
+    camera, file = pair.cameras[i], pair.disparities[i]
+    depth = np.zeros(pair.hw, np.float32)
+    if file is not None:
+        code = _read_disparity(file, pair.hw)
+        disparity = code.astype(np.float64) / pair.codes_per_px + pair.doffs
+        is_known = code > 0 if file.suffix == ".png" else np.isfinite(disparity)
+        # Disparities in px up to this value give no depth: they are too small to be measured.
+        usable = is_known & (disparity > 1e-3)
+        f = camera.f[0, 0].double().item()
+        depth = np.where(usable, f * pair.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
+    return Frame(image[None], torch.from_numpy(depth)[None], camera)
 
 
-def _read_npz_pair(root: Path) -> _LoadPair:
+def _read_calib_pair(root: Path) -> tuple[Path, _Pair]:
+    file = root / "calib.txt"
+    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
+    images = (root / "im0.png", root / "im1.png")
+    hw = files.read_image_header(images[0]).hw
+    names = ("height", "width", "baseline", "doffs")
+    h, w, baseline, doffs = (float(files.to_array(entries.get(name), (), file, name)) for name in names)
+    if (h, w) != hw:
+        raise FormatError(file, "width and height", f"{w:g}x{h:g}", f"{hw[1]}x{hw[0]}, as im0.png")
+    maps = [[root / f"disp{i}.pfm", root / f"disp{i}GT.pfm"] for i in (0, 1)]
+    first, second = (next((each for each in named if each.is_file()), None) for named in maps)
+    if first is None:
+        raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
+    # Matlab's [a b c; d e f; g h i]
+    matrices = [[row.split() for row in entries.get(f"cam{i}", "").strip("[]").split(";")] for i in (0, 1)]
+    left, right = (convert.to_camera(matrix, hw, file, f"cam{i}") for i, matrix in enumerate(matrices))
+    return file, _Pair(images, (first, second), (left, right), hw, baseline / 1000, doffs)
+
+
+def _read_npz_pair(root: Path) -> tuple[Path, _Pair]:
     names = {}
     for kind in ("left.png", "right.png", "disp.npz"):
         matching = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
@@ -138,15 +155,13 @@ def _read_npz_pair(root: Path) -> _LoadPair:
     file = root / "meta.json"
     meta = files.read_json(file)
     hw = files.read_image_header(names["left.png"]).hw
-    cameras = [convert.to_camera(meta.get(key), hw, file, key) for key in ("K_left", "K_right")]
+    left, right = (convert.to_camera(meta.get(key), hw, file, key) for key in ("K_left", "K_right"))
     baseline, doffs = (float(files.to_array(meta.get(key), (), file, key)) for key in ("baseline_m", "doffs"))
     images = (names["left.png"], names["right.png"])
-    return _check_pair(
-        _LoadPair(images, (names["disp.npz"], None), (cameras[0], cameras[1]), hw, baseline, doffs), file
-    )
+    return file, _Pair(images, (names["disp.npz"], None), (left, right), hw, baseline, doffs)
 
 
-def _read_views_pair(root: Path) -> _LoadPair:
+def _read_views_pair(root: Path) -> tuple[Path, _Pair]:
     file = root / "dmin.txt"
     images = (root / "view1.png", root / "view5.png")
     hw = files.read_image_header(images[0]).hw
@@ -154,24 +169,10 @@ def _read_views_pair(root: Path) -> _LoadPair:
     doffs = float(files.to_array(files.read_text(file).strip(), (), file, "shift")) / factor
     f = _VIEWS_FOCAL_PX / factor
     c = ((hw[1] - 1) / 2, (hw[0] - 1) / 2)
-    cameras = [convert.to_camera([[f, 0, c[0] + x], [0, f, c[1]], [0, 0, 1]], hw, file, "K") for x in (0, doffs)]
+    left, right = (convert.to_camera([[f, 0, c[0] + x], [0, f, c[1]], [0, 0, 1]], hw, file, "K") for x in (0, doffs))
     second = root / "disp5.png"
     maps = (root / "disp1.png", second if second.is_file() else None)
-    pair = _LoadPair(images, maps, (cameras[0], cameras[1]), hw, _VIEWS_BASELINE_M, doffs, factor)
-    return _check_pair(pair, file)
-
-
-def _check_pair(pair: _LoadPair, file: Path) -> _LoadPair:
-    """Check the calibration: positive baseline, equal focal lengths, ``doffs`` = difference of the principal points."""
-    if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
-        raise FormatError(file, "baseline", pair.baseline, "a positive length")
-    left, right = pair.cameras
-    if not torch.equal(left.f, right.f):
-        raise FormatError(file, "focal length", f"{left.f.tolist()} and {right.f.tolist()}", "equal ones")
-    shift = float(right.c[0, 0] - left.c[0, 0])
-    if abs(shift - pair.doffs) > 0.5:
-        raise FormatError(file, "doffs", pair.doffs, f"{shift:g}, the difference of the principal points")
-    return pair
+    return file, _Pair(images, maps, (left, right), hw, _VIEWS_BASELINE_M, doffs, factor)
 
 
 def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
@@ -183,16 +184,3 @@ def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if disparity.shape != hw:
         raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
     return disparity
-
-
-def _parse_matrix(entries: dict[str, str], key: str, file: Path) -> list[list[str]]:
-    """Matlab's ``[a b c; d e f; g h i]`` → rows of texts."""
-    return [row.split() for row in entries.get(key, "").strip("[]").split(";")]
-
-
-def _parse_number(entries: dict[str, str], key: str, file: Path) -> float:
-    return float(files.to_array(entries.get(key), (), file, key))
-
-
-def _find_first(root: Path, *names: str) -> Path | None:
-    return next((root / name for name in names if (root / name).is_file()), None)
