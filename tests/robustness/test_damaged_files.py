@@ -27,7 +27,6 @@ pytest.importorskip("pyarrow")
 from support import byte_damage as mutations
 from support import damage_harness as hostile
 from support.captures_by_format import SAMPLES as CAPTURES
-from support.captures_by_format import write_tum
 from support.other_inputs import OTHER_INPUTS
 
 from dhtorch import data
@@ -109,7 +108,7 @@ def test_a_command_says_what_is_no_file(
 ) -> None:
     monkeypatch.setattr(hostile, "PATIENCE", 30)
     monkeypatch.setattr(hostile, "SECONDS", 20)
-    write_tum(capture := tmp_path / "capture")
+    CAPTURES["tum"][0](capture := tmp_path / "capture")
     mutations.STRANGE_FILES[kind](path := tmp_path / f"x{suffix}")
     places = {"PATH": str(path), "CAPTURE": str(capture), "OUT": str(tmp_path / "out")}
     words = [re.sub("|".join(places), lambda found: places[found[0]], word) for word in COMMANDS[name]]
@@ -223,5 +222,5 @@ def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
 
 
 def test_what_opens_is_what_reads(tmp_path: Path) -> None:
-    write_tum(tmp_path)
+    CAPTURES["tum"][0](tmp_path)
     assert len(data.open(tmp_path)) == 3

@@ -14,6 +14,7 @@ import torch
 
 from dhtorch.data.codecs import pickles, tiff
 from dhtorch.data.readers import rh20t
+from dhtorch.experiments.focal.stacks import FocalStack
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 from support import record3d_captures, stray_frames, writers
@@ -36,31 +37,6 @@ def small_walk(n: int = 3) -> list[Frame]:
     return walk(n, hw=(24, 32))
 
 
-# ------------------------------------------------------------------------------------------------ frames in folders
-
-
-def write_tum(root: Path) -> None:
-    """A TUM RGB-D sequence."""
-    writers.write_tum(root, small_walk())
-
-
-def write_named(root: Path) -> None:
-    """Frames whose files are named by their times."""
-    writers.write_named_frames(root, small_walk(), fps=30)
-
-
-def write_unregistered(root: Path) -> None:
-    """Frames with a depth camera, whose files are named by their times."""
-    frames = small_walk()
-    writers.write_named_frames(root, [f.replace(depth_camera=f.camera) for f in frames], fps=30)
-
-
-def write_driving(root: Path) -> None:
-    """A log of one camera on a car that stands still."""
-    standstill = Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
-    writers.write_driving(root, {"FRONT": small_walk()}, standstill)
-
-
 def pair_writer(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path], None]:
     """The function that writes a stereo pair with a baseline of 12.5 cm by ``write``."""
 
@@ -76,69 +52,10 @@ def pair_writer(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path],
     return write_pair
 
 
-# ------------------------------------------------------------------------------------------------ phones
-
-
-def write_arkitscenes(root: Path) -> Path:
-    """An ARKitScenes capture with laser depth."""
-    root = root / "raw" / "Training" / "41048190"
-    frames = shots(100 + np.arange(3) / 60)
-    assets = {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": shots([100.0], VGA, VGA_HW)}
-    writers.write_arkitscenes(root, assets, trajectory=frames)
-    return root
-
-
-def write_stray(root: Path) -> None:
-    """A Stray Scanner capture with a camera in every row."""
-    writers.write_stray(root, stray_frames.walk(), per_frame=True)
-
-
-def write_old_stray(root: Path) -> None:
-    """A Stray Scanner capture of an older version, whose video lacks its first picture."""
-    writers.write_stray(root, stray_frames.walk(), depth_format="npy", codec="libx265", first_picture="lost")
-
-
-# ------------------------------------------------------------------------------------------------ robots
-
-
-def write_lerobot_v3(root: Path) -> None:
-    """A LeRobot v3 data set with depth in a video."""
-    first, second = two_episodes()
-    writers.write_lerobot(root, [first, second[:2]], depth="video")
-
-
-def write_lerobot_v2(root: Path) -> None:
-    """A LeRobot v2.1 data set with pictures in tables and intrinsics in a file beside."""
-    writers.write_lerobot(root, two_episodes()[:1], version=2, image="image", depth="tiff", intrinsics="side-car")
-
-
-def write_rlds(root: Path) -> Path:
-    """An RLDS data set of two episodes."""
-    writers.write_rlds(root / "1.0.0", three_episodes()[:2])
-    return root / "1.0.0"
-
-
-def write_rlds_array(root: Path) -> Path:
-    """An RLDS data set with depth as an array, whose features do not name their encoding."""
-    writers.write_rlds(root / "1.0.0", three_episodes()[:1], depth="array", has_size=False)
-    return root / "1.0.0"
-
-
-def write_rh20t(root: Path) -> Path:
-    """An RH20T scene with a fixed camera and one on the hand."""
-    return writers.write_rh20t(root, {FIXED: still(2), HAND: moving(2)}, T_world_from_base=BASE)
-
-
 def read_rh20t(root: Path) -> None:
     """Reads frames and robot streams of an RH20T scene."""
     read_all(root)
     rh20t.read_robot_streams(root)
-
-
-def write_simulator(root: Path) -> Path:
-    """A ManiSkill file of one episode."""
-    write_simulator_hdf5(root / "a.h5", [small_walk(2)], "maniskill3")
-    return root / "a.h5"
 
 
 def bag_writer(layout: BagLayout) -> Callable[[Path], Path]:
@@ -157,46 +74,35 @@ def bag_writer(layout: BagLayout) -> Callable[[Path], Path]:
     return write
 
 
-def write_kinect(root: Path) -> Path:
-    """An Azure Kinect video of both cameras with its calibration."""
-    frames = [frame.replace(depth=torch.ones(1, 288, 320)) for frame in walk(2, hw=(36, 64))]
-    write_azure_kinect(root / "a.mkv", frames, T_colour_from_depth=se3.identity(1, torch.zeros(1).double()))
-    return root / "a.mkv"
+def at(path: str, write: Callable[[Path], object]) -> Callable[[Path], Path]:
+    """The function that writes below a folder by ``write`` and returns what to open there."""
+
+    def write_below(root: Path) -> Path:
+        write(root)
+        return root / path
+
+    return write_below
 
 
-# ------------------------------------------------------------------------------------------------ focal stacks, files
+def arkitscenes() -> dict[str, list[Frame]]:
+    """Assets of an ARKitScenes capture with laser depth."""
+    frames = shots(100 + np.arange(3) / 60)
+    return {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": shots([100.0], VGA, VGA_HW)}
 
 
-def write_ddff12(root: Path) -> Path:
-    """A DDFF 12-Scene file of two splits."""
-    train, val = [random_stack(0, 10), random_stack(1, 10)], [random_stack(2, 10)]
-    stack_writers.write_ddff12(root / "a.h5", {"train": train, "val": val}, compression="gzip")
-    return root / "a.h5"
+def focal_splits() -> dict[str, list[FocalStack]]:
+    """Focal stacks of two splits."""
+    return {"train": [random_stack(0, 10), random_stack(1, 10)], "val": [random_stack(2, 10)]}
 
 
-def write_light_field(root: Path) -> None:
-    """A raw light field of DDFF 12-Scene with its depth."""
-    field = light_field(torch.tensor(0.1), (12, 16), 3)
-    stack_writers.write_light_field(root, "train/a", 1, field, torch.ones(1, 12, 16))
+def kinect() -> list[Frame]:
+    """Frames with depth of the device's size."""
+    return [frame.replace(depth=torch.ones(1, 288, 320)) for frame in walk(2, hw=(36, 64))]
 
 
-def write_focus_stack(root: Path) -> Path:
-    """A folder of images that is named as a focal stack."""
-    stack_writers.write_image_folder(root / "focus_stack", random_stack(0, 3))
-    return root / "focus_stack"
-
-
-def write_pickle(root: Path) -> Path:
-    """A pickled ``.npy`` file."""
-    np.save(root / "x.npy", plain_values(), allow_pickle=True)
-    return root / "x.npy"
-
-
-def write_tiff(root: Path) -> Path:
-    """A compressed TIFF of float32 numbers."""
-    tifffile.imwrite(root / "a.tiff", np.ones((40, 50), np.float32), compression="zlib", predictor=True)
-    return root / "a.tiff"
-
+AT_REST = se3.identity(1, torch.zeros(1).double())
+STANDSTILL = Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
+ARKIT_VIDEO = "raw/Training/41048190"
 
 #: Bags need the library rosbags to be written.
 BAGS: dict[str, Callable[[Path], Path]] = (
@@ -218,9 +124,11 @@ SAMPLES: dict[str, Sample] = {
     **{
         name: (write, read_all)
         for name, write in {
-            "tum": write_tum,
-            "named": write_named,
-            "unregistered": write_unregistered,
+            "tum": lambda root: writers.write_tum(root, small_walk()),
+            "named": lambda root: writers.write_named_frames(root, small_walk(), fps=30),
+            "unregistered": lambda root: writers.write_named_frames(
+                root, [f.replace(depth_camera=f.camera) for f in small_walk()], fps=30
+            ),
             "counted": lambda root: writers.write_counted_frames(root, small_walk()),
             "icl_nuim": lambda root: writers.write_icl_nuim(root, small_walk()),
             "ros_tum": lambda root: writers.write_ros_tum(root, small_walk()),
@@ -230,33 +138,68 @@ SAMPLES: dict[str, Sample] = {
             "sens_folder": lambda root: writers.write_sens_folder(root, small_walk()),
             "open3d": lambda root: writers.write_open3d(root, small_walk()),
             "sun3d": lambda root: writers.write_sun3d(root, small_walk()),
-            "driving": write_driving,
+            "driving": lambda root: writers.write_driving(root, {"FRONT": small_walk()}, STANDSTILL),
             "calib_pair": pair_writer(writers.write_calib_pair),
             "npz_pair": pair_writer(writers.write_npz_pair),
-            "arkitscenes": write_arkitscenes,
+            "arkitscenes": at(
+                ARKIT_VIDEO,
+                lambda root: writers.write_arkitscenes(
+                    root / ARKIT_VIDEO, arkitscenes(), trajectory=shots(100 + np.arange(3) / 60)
+                ),
+            ),
             "ca1m": lambda root: ca1m_archive(root, n=2)[0],
             "record3d_archive": record3d_captures.r3d_archive,
             "record3d_exr": lambda root: writers.write_record3d_exr(root, record3d_captures.walk()),
             "record3d_mp4": lambda root: record3d_captures.rgbd_video(root)[0],
-            "stray": write_stray,
-            "stray_old": write_old_stray,
-            "lerobot_v3": write_lerobot_v3,
-            "lerobot_v2": write_lerobot_v2,
-            "rlds": write_rlds,
-            "rlds_array": write_rlds_array,
+            "stray": lambda root: writers.write_stray(root, stray_frames.walk(), per_frame=True),
+            "stray_old": lambda root: writers.write_stray(
+                root, stray_frames.walk(), depth_format="npy", codec="libx265", first_picture="lost"
+            ),
+            "lerobot_v3": lambda root: writers.write_lerobot(
+                root, [two_episodes()[0], two_episodes()[1][:2]], depth="video"
+            ),
+            "lerobot_v2": lambda root: writers.write_lerobot(
+                root, two_episodes()[:1], version=2, image="image", depth="tiff", intrinsics="side-car"
+            ),
+            "rlds": at("1.0.0", lambda root: writers.write_rlds(root / "1.0.0", three_episodes()[:2])),
+            "rlds_array": at(
+                "1.0.0",
+                lambda root: writers.write_rlds(root / "1.0.0", three_episodes()[:1], depth="array", has_size=False),
+            ),
             "nerfstudio": lambda root: writers.write_nerfstudio(root, small_walk()),
             "polycam": lambda root: writers.write_polycam(root, small_walk()),
             "colmap": lambda root: writers.write_colmap_capture(root, small_walk()),
-            "simulator_hdf5": write_simulator,
-            "azure_kinect": write_kinect,
+            "simulator_hdf5": at(
+                "a.h5", lambda root: write_simulator_hdf5(root / "a.h5", [small_walk(2)], "maniskill3")
+            ),
+            "azure_kinect": at(
+                "a.mkv", lambda root: write_azure_kinect(root / "a.mkv", kinect(), T_colour_from_depth=AT_REST)
+            ),
             **BAGS,
             "fod500": lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}),
-            "ddff12": write_ddff12,
-            "light_field": write_light_field,
-            "images": write_focus_stack,
+            "ddff12": at(
+                "a.h5", lambda root: stack_writers.write_ddff12(root / "a.h5", focal_splits(), compression="gzip")
+            ),
+            "light_field": lambda root: stack_writers.write_light_field(
+                root, "train/a", 1, light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
+            ),
+            "images": at(
+                "focus_stack", lambda root: stack_writers.write_image_folder(root / "focus_stack", random_stack(0, 3))
+            ),
         }.items()
     },
-    "rh20t": (write_rh20t, read_rh20t),
-    "pickle": (write_pickle, pickles.read_npy),
-    "tiff": (write_tiff, tiff.read_tiff),
+    "rh20t": (
+        lambda root: writers.write_rh20t(root, {FIXED: still(2), HAND: moving(2)}, T_world_from_base=BASE),
+        read_rh20t,
+    ),
+    "pickle": (at("x.npy", lambda root: np.save(root / "x.npy", plain_values(), allow_pickle=True)), pickles.read_npy),
+    "tiff": (
+        at(
+            "a.tiff",
+            lambda root: tifffile.imwrite(
+                root / "a.tiff", np.ones((40, 50), np.float32), compression="zlib", predictor=True
+            ),
+        ),
+        tiff.read_tiff,
+    ),
 }

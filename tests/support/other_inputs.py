@@ -45,7 +45,7 @@ from dhtorch.runtime import results as result_files
 from dhtorch.stages.score import LearnedScore
 from dhtorch.viz.viewer.points import read_ply_exhibit
 from support import room_models, writers
-from support.captures_by_format import Sample, small_walk, write_lerobot_v2, write_lerobot_v3, write_tum
+from support.captures_by_format import SAMPLES, Sample, small_walk
 from support.damage_harness import read_all
 from support.small_result import result
 
@@ -209,7 +209,7 @@ def read_settings(path: Path) -> None:
 def _enriched() -> Path:
     folder = Path(_kept_folder("enriched").name)
     (folder / "source").mkdir()
-    write_lerobot_v3(folder / "source")
+    SAMPLES["lerobot_v3"][0](folder / "source")
     asked = ["method=paper", "method.n=32", "method.hypotheses=5", "gap=1", "dense=false", "report=false", "--quiet"]
     assert commands.main(["enrich", str(folder / "source"), str(folder / "set"), *asked]) == 0
     return folder / "set"
@@ -251,7 +251,7 @@ def read_enriched(path: Path) -> None:
 def _extraction() -> Path:
     folder = Path(_kept_folder("extraction").name)
     (folder / "source").mkdir()
-    write_tum(folder / "source")
+    SAMPLES["tum"][0](folder / "source")
     asked = ["method=paper", "method.n=32", "method.hypotheses=5", "gap=1", f"out={folder / 'set'}", "--quiet"]
     assert commands.main(["extract", str(folder / "source"), *asked]) == 0
     return folder / "set"
@@ -331,8 +331,8 @@ OTHER_INPUTS: dict[str, Sample] = {
     "calibration": (write_calibration, as_format_error(read_calibration, ValueError, OSError)),
     "learned_score": (write_learned_score, as_format_error(LearnedScore.read, ValueError, OSError)),
     "settings": (write_settings, read_settings),
-    "lerobot_source_v3": (write_lerobot_v3, read_source),
-    "lerobot_source_v2": (write_lerobot_v2, read_source),
+    "lerobot_source_v3": (SAMPLES["lerobot_v3"][0], read_source),
+    "lerobot_source_v2": (SAMPLES["lerobot_v2"][0], read_source),
     "enriched": (write_enriched, read_enriched),
     "extraction": (write_extraction, read_extraction),
     **{
@@ -340,5 +340,5 @@ OTHER_INPUTS: dict[str, Sample] = {
         for kind in ("colmap_txt", "colmap_bin", "nerfstudio", "splat", "npz", "npz_views")
     },
     "pin_picture": (write_picture, as_format_error(read_reference, ValueError, OSError)),
-    "pin_reference": (write_tum, as_format_error(read_reference, ValueError, OSError)),
+    "pin_reference": (SAMPLES["tum"][0], as_format_error(read_reference, ValueError, OSError)),
 }
