@@ -103,7 +103,7 @@ def is_in_use() -> bool:
     """
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return False
-    return loader.is_loaded() or loader.load_if_present()
+    return loader.load_if_present()
 
 
 def can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:

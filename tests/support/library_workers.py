@@ -54,5 +54,5 @@ if __name__ == "__main__":
     del os.environ["DHTORCH_OPS"]
     for cache in caches:
         os.environ["DHTORCH_CACHE"] = cache
-        assert not loader.is_loaded() and not loader._tried
+        assert not loader._loaded and not loader._tried
         print(json.dumps(list(DataLoader(Workers(count, expected), 1, num_workers=count, collate_fn=as_lists))))

@@ -11,15 +11,14 @@ from __future__ import annotations
 import gc
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from dhtorch.data.codecs.npy import parse_npy_header
-from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.decode import FormatError, read_bytes
 from dhtorch.data.pickled_arrays import (
     PERMITTED_CALLS,
     PERMITTED_NAMES,
@@ -30,7 +29,7 @@ from dhtorch.data.pickled_arrays import (
     array_from_bytes,
     check_scalar,
 )
-from dhtorch.runtime import safe_open as doors
+from dhtorch.runtime import safe_open
 
 _MAX_PICKLE_BYTES: Final = 128_000_000
 _MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle
@@ -54,7 +53,7 @@ def read_npy(file: Path) -> Any:
     Raises:
         FormatError: missing or damaged file, or a pickle with any other content or call.
     """
-    data = files.read_bytes(file, _MAX_PICKLE_BYTES)
+    data = read_bytes(file, _MAX_PICKLE_BYTES)
     shape, fortran, dtype, start = parse_npy_header(file, "header", data)
     body = data[start:]
     if dtype.hasobject:
@@ -93,10 +92,8 @@ class _Unpickler:
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
         self.steps = self.nodes = 0
-        self.taken, self.most = (
-            0,
-            max(doors.MAX_MEMORY_BYTES, doors.MAX_MEMORY_RATIO * len(data)),
-        )  # memory of Python objects in bytes, and its limit
+        self.taken = 0  # memory of Python objects in bytes
+        self.most = max(safe_open.MAX_MEMORY_BYTES, safe_open.MAX_MEMORY_RATIO * len(data))
         self.budget = 4 * len(data) + 4096  # bytes that calls may still create: shared values could multiply
 
     def run(self) -> Any:
@@ -152,7 +149,7 @@ class _Unpickler:
     def take_memory(self, n: int) -> None:
         self.taken += n
         if self.taken > self.most:
-            doors.check_memory(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
+            safe_open.check_memory(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
 
     def top(self, kind: type) -> Any:
         if type(self.stack[-1]) is not kind:
@@ -167,6 +164,13 @@ class _Unpickler:
         return items
 
     # ---------------------------------------------------------------------------------------------------- instructions
+
+    def push_text(self, form: str) -> None:
+        self.push(self.take(self.unpack(form)).decode("utf-8", "surrogatepass"))
+
+    def extend(self, kind: type, items: Iterable[Any]) -> None:
+        target = self.top(kind)
+        (target.update if kind is set else target.extend)(items)
 
     def set_items(self, items: list[Any]) -> None:
         target = self.top(dict)
@@ -232,50 +236,6 @@ class _Unpickler:
         raise TypeError(f"a bare {kind.__name__} is no data")
 
 
-def _push_number(form: str) -> Callable[[_Unpickler], None]:
-    """Instruction that pushes a number stored as ``form`` of the struct module."""
-    return lambda m: m.push(m.unpack(form))
-
-
-def _push_text(form: str) -> Callable[[_Unpickler], None]:
-    return lambda m: m.push(m.take(m.unpack(form)).decode("utf-8", "surrogatepass"))
-
-
-def _push_bytes(form: str) -> Callable[[_Unpickler], None]:
-    return lambda m: m.push(m.take(m.unpack(form)))
-
-
-def _store_memo(form: str) -> Callable[[_Unpickler], None]:
-    return lambda m: m.remember(m.unpack(form))
-
-
-def _push_memo(form: str) -> Callable[[_Unpickler], None]:
-    return lambda m: m.recall(m.unpack(form))
-
-
-def _push_collected(make: Callable[[Any], Any]) -> Callable[[_Unpickler], None]:
-    return lambda m: m.push(make(m.since_mark()))
-
-
-def _push_tuple(n: int) -> Callable[[_Unpickler], None]:
-    return lambda m: m.push(m.pop_n(n))
-
-
-def _append_to_list(machine: _Unpickler) -> None:
-    (value,) = machine.pop_n(1)
-    machine.top(list).append(value)
-
-
-def _extend_list(machine: _Unpickler) -> None:
-    items = machine.since_mark()
-    machine.top(list).extend(items)
-
-
-def _add_to_set(machine: _Unpickler) -> None:
-    items = machine.since_mark()
-    machine.top(set).update(map(check_scalar, items))
-
-
 _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
     ord(code): step
     for code, step in {
@@ -288,38 +248,38 @@ _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
         "N": lambda m: m.push(None),
         "\x88": lambda m: m.push(True),
         "\x89": lambda m: m.push(False),
-        "J": _push_number("<i"),
-        "K": _push_number("<B"),
-        "M": _push_number("<H"),
-        "G": _push_number(">d"),
+        "J": lambda m: m.push(m.unpack("<i")),
+        "K": lambda m: m.push(m.unpack("<B")),
+        "M": lambda m: m.push(m.unpack("<H")),
+        "G": lambda m: m.push(m.unpack(">d")),
         "\x8a": lambda m: m.integer(m.unpack("<B")),
         "\x8b": lambda m: m.integer(m.unpack("<i")),
-        "X": _push_text("<I"),
-        "\x8c": _push_text("<B"),
-        "\x8d": _push_text("<Q"),
-        "B": _push_bytes("<I"),
-        "C": _push_bytes("<B"),
-        "\x8e": _push_bytes("<Q"),
-        "\x96": _push_bytes("<Q"),  # a byte array
+        "X": lambda m: m.push_text("<I"),
+        "\x8c": lambda m: m.push_text("<B"),
+        "\x8d": lambda m: m.push_text("<Q"),
+        "B": lambda m: m.push(m.take(m.unpack("<I"))),
+        "C": lambda m: m.push(m.take(m.unpack("<B"))),
+        "\x8e": lambda m: m.push(m.take(m.unpack("<Q"))),
+        "\x96": lambda m: m.push(m.take(m.unpack("<Q"))),  # a byte array
         "]": lambda m: m.push([]),
         "}": lambda m: m.push({}),
         ")": lambda m: m.push(()),
         "\x8f": lambda m: m.push(set()),
-        "l": _push_collected(list),
-        "t": _push_collected(tuple),
-        "\x85": _push_tuple(1),
-        "\x86": _push_tuple(2),
-        "\x87": _push_tuple(3),
-        "a": _append_to_list,
-        "e": _extend_list,
-        "\x90": _add_to_set,
+        "l": lambda m: m.push(list(m.since_mark())),
+        "t": lambda m: m.push(tuple(m.since_mark())),
+        "\x85": lambda m: m.push(m.pop_n(1)),
+        "\x86": lambda m: m.push(m.pop_n(2)),
+        "\x87": lambda m: m.push(m.pop_n(3)),
+        "a": lambda m: m.extend(list, m.pop_n(1)),
+        "e": lambda m: m.extend(list, m.since_mark()),
+        "\x90": lambda m: m.extend(set, map(check_scalar, m.since_mark())),
         "s": lambda m: m.set_items(list(m.pop_n(2))),
         "u": lambda m: m.set_items(m.since_mark()),
-        "q": _store_memo("<B"),
-        "r": _store_memo("<I"),
+        "q": lambda m: m.remember(m.unpack("<B")),
+        "r": lambda m: m.remember(m.unpack("<I")),
         "\x94": lambda m: m.remember(len(m.memo)),
-        "h": _push_memo("<B"),
-        "j": _push_memo("<I"),
+        "h": lambda m: m.recall(m.unpack("<B")),
+        "j": lambda m: m.recall(m.unpack("<I")),
         "c": lambda m: m.name(m.line(), m.line()),
         "\x93": lambda m: m.name(*m.pop_n(2)),
         "R": _Unpickler.call,
