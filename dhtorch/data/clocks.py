@@ -17,26 +17,12 @@ from dhtorch.data.convert import slerp
 #: Largest distance of a picture from its row, in steps of the rows' clock. Source: derived: half a step separates two
 #: rows; less, because the film's stamps jitter.
 _MAX_PAIR_STEPS = 0.4
-#: Share of a picture's distance by which the offset between the clocks follows it: compensates clocks of slightly
-#: different speed, but not the jitter of single stamps. Source: chosen: a drift of 0.1 step per picture is followed.
-_DRIFT_GAIN = 0.2
-#: Relative deviation of a film's steps from their median up to which its rate counts as constant. Source: derived: the
-#: clock of Matroska (1 ms) rounds steps of 60 Hz by 6 %, and a lost picture doubles a step.
-_MAX_STEP_DEVIATION = 0.25
-#: Distance in steps of a row from the picture of its place, beyond which films with as many pictures as rows, but with
-#: gaps where the table has none, are paired by stamps. Source: derived: one step less jitter.
-_MAX_PLACE_STEPS = 0.75
 #: Starts of a film that are tried, in rows or pictures beyond the difference of their counts; and their largest count.
 #: Source: chosen: both streams may lack a few at their start.
 _MORE_STARTS, _MAX_STARTS = 2, 32
 #: Mean distances up to this factor and this many steps above the least one count as equal. Source: chosen: above the
 #: rounding of stamps to milliseconds.
 _EQUAL_FIT_FACTOR, _EQUAL_FIT_STEPS = 1.5, 0.03
-#: Least share of pictures (or rows, where these are fewer) that a pairing by stamps must cover. Source: chosen.
-_MIN_PAIRED = 0.6
-#: Largest mean distance of a pairing by stamps, in steps. Source: derived: that of arbitrary stamps is half of
-#: ``_MAX_PAIR_STEPS``.
-_MAX_MEAN_STEPS = 0.15
 
 #: Frame rates in Hz that are plausible without a nominal one. Source: chosen: time-lapse to high-speed cameras.
 _PLAUSIBLE_HZ = (0.2, 1000.0)
@@ -93,13 +79,20 @@ def pair_film(pictures: np.ndarray, rows: np.ndarray) -> list[FilmPairing]:
         return _pair_by_place(n, m)
     step, film_step = float(np.median(np.diff(rows))), float(np.median(np.diff(pictures)))
     speeds = dict.fromkeys((1.0, step / film_step))
-    constant = bool((np.abs(np.diff(pictures) / film_step - 1) <= _MAX_STEP_DEVIATION).all())
-    if n == m and (constant or min(_place_error(pictures, rows, speed) for speed in speeds) <= _MAX_PLACE_STEPS * step):
+    # Relative deviation of a film's steps from their median up to which its rate counts as constant. Source: derived:
+    # the clock of Matroska (1 ms) rounds steps of 60 Hz by 6 %, and a lost picture doubles a step.
+    constant = bool((np.abs(np.diff(pictures) / film_step - 1) <= 0.25).all())
+    # Distance in steps of a row from the picture of its place, beyond which films with as many pictures as rows, but
+    # with gaps where the table has none, are paired by stamps. Source: derived: one step less jitter.
+    if n == m and (constant or min(_place_error(pictures, rows, speed) for speed in speeds) <= 0.75 * step):
         return _pair_by_place(n, m)
     fits = [_Fit.of(pictures, rows, speed, start) for speed in speeds for start in _starts(n, m)]
-    fits = [fit for fit in fits if fit.error <= _MAX_MEAN_STEPS]
+    # Largest mean distance of a pairing by stamps, in steps. Source: derived: that of arbitrary stamps is half of
+    # ``_MAX_PAIR_STEPS``.
+    fits = [fit for fit in fits if fit.error <= 0.15]
     most = max((fit.count for fit in fits), default=0)
-    if most < min(n, m) * (1 if constant else _MIN_PAIRED):
+    # Least share of pictures (or rows, where these are fewer) that a pairing by stamps must cover. Source: chosen.
+    if most < min(n, m) * (1 if constant else 0.6):
         return _pair_by_place(n, m)
     best = min((fit for fit in fits if fit.count == most), key=lambda fit: (fit.speed != 1, fit.error))
     limit = max(_EQUAL_FIT_FACTOR * best.error, best.error + _EQUAL_FIT_STEPS)
@@ -165,7 +158,10 @@ class _Fit:
             if i > last and abs(distance) <= _MAX_PAIR_STEPS * step:
                 picture[i], last = j, i
                 distances.append(abs(distance) / step)
-                offset += _DRIFT_GAIN * distance
+                # Share of a picture's distance by which the offset between the clocks follows it: compensates clocks of
+                # slightly different speed, but not the jitter of single stamps. Source: chosen: a drift of 0.1 step per
+                # picture is followed.
+                offset += 0.2 * distance
         return cls(start, speed, picture, len(distances), float(np.mean(distances)) if distances else np.inf)
 
 

@@ -19,9 +19,6 @@ from dhtorch.data.units import DepthUnit, parse_unit
 from dhtorch.records import Frame
 from dhtorch.runtime.console import format_count
 
-#: Relative difference up to which a recording's rate is that of its own stamps. Source: derived: rounding.
-_MEASURED_RATE_REL = 1e-3
-
 
 @dataclass(frozen=True)
 class Corrections:
@@ -76,7 +73,8 @@ class Corrections:
         if recording.times is None or len(recording) < 2:
             return recording
         times, nominal = recording.times.numpy(), recording.rate_hz
-        if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < _MEASURED_RATE_REL:
+        # Relative difference up to which a recording's rate is that of its own stamps. Source: derived: rounding.
+        if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < 1e-3:
             nominal = None  # a rate that was measured by the same stamps
         remark = describe_rate(times, nominal)
         return recording if remark is None else replace(recording, report=(*recording.report, remark))

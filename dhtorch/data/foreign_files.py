@@ -57,7 +57,7 @@ _VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 #: Endings of files, other than images, that may hold depth.
 _DEPTH_SUFFIXES: Final = (*_ARRAY_SUFFIXES, ".exr", ".tif", ".tiff", ".h5", ".hdf5", ".pgm", ".raw", ".bin")
 
-#: Entries of a folder and of each level below that are looked at. Limits the time. Source: origin not recorded.
+#: Entries of a folder and of each level below that are looked at. Limits the time.
 _MAX_ENTRIES: Final = 10_000
 #: Folders and files that the description of a folder names. Limits its length.
 _MAX_NAMED: Final = 5

@@ -37,14 +37,6 @@ SYMMETRY_NAMES: Final = (
 #: Value of option ``depth_turn`` → symmetry of the stored depth; degrees are counter-clockwise.
 DEPTH_TURNS: Final = {"90": 3, "180": 2, "270": 1, "left_right": 4, "upside_down": 6}
 
-#: Frames of a recording that are decoded for a decision by edges.
-#: Source: chosen on the captures of tests/data/test_orientation.py, where three to five frames decide 422 of 499 times.
-_N_DECIDING_FRAMES = 5
-
-#: Difference of the offsets of K's principal point from the centres of the stored and the turned picture, in image
-#: sizes, below which K does not show how it lies. Source: derived: offsets of real cameras are within 0.05.
-_MIN_MISFIT_DIFFERENCE = 0.05
-
 #: Longer side of the grid on which edges are compared, px; limits the sharpness of edges, about that of LiDAR maps.
 #: Source: chosen on the captures of tests/data/test_orientation.py (80 and 320 were no better).
 _GRID_PX = 160
@@ -54,10 +46,6 @@ _BLUR_PX = 1.0
 #: Edge strength up to which a pixel counts, in mean strengths: one silhouette must not decide alone.
 #: Source: as :data:`_BLUR_PX`.
 _MAX_EDGE_STRENGTH = 3.0
-#: Grey value, of 255, added before the logarithm: noise of dark pixels makes no edges. Source: origin not recorded.
-_DARK_OFFSET = 16.0
-#: Share of a grid pixel's neighbourhood that must have returns. Source: origin not recorded.
-_MIN_COVERAGE = 0.5
 #: Least lead of the best symmetry's mean score over the second one's for a decision.
 #: Source: chosen on the same captures: no wrong decision on three or more of their frames.
 MIN_ORIENTATION_LEAD = 0.04
@@ -95,7 +83,8 @@ def picture_edges(image: Tensor, *, grid_px: int) -> Tensor:
     grey = image.float().mean(0) * (1.0 if image.dtype == torch.uint8 else 255.0)
     scale = grid_px / max(grey.shape)
     hw = max(2, round(grey.shape[0] * scale)), max(2, round(grey.shape[1] * scale))
-    return _edge_vectors(_blur((_resample(grey, hw) + _DARK_OFFSET).log()), torch.ones(hw, dtype=torch.bool))
+    # Grey value, of 255, added before the logarithm: noise of dark pixels makes no edges.
+    return _edge_vectors(_blur((_resample(grey, hw) + 16.0).log()), torch.ones(hw, dtype=torch.bool))
 
 
 def depth_edges(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -108,7 +97,8 @@ def smooth_log_depth(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor
     has_return = depth > 0
     inverse = torch.where(has_return, 1 / torch.where(has_return, depth, 1.0), 0.0)
     total, coverage = _blur(_resample(inverse, hw)), _blur(_resample(has_return, hw))
-    covered = coverage > _MIN_COVERAGE
+    # Fraction of a grid pixel's neighbourhood that must have returns.
+    covered = coverage > 0.5
     return torch.where(covered, total / coverage.clamp_min(1e-6), 1.0).clamp_min(1e-9).log(), covered
 
 
@@ -231,7 +221,9 @@ def _decide_symmetry(recording: Recording, stored: StoredSizes) -> tuple[int, st
 
 def _select(recording: Recording, candidates: Sequence[int]) -> int | None:
     """The candidate that the edges of a few frames support; None = undecided."""
-    places = sorted(set(torch.linspace(0, len(recording) - 1, _N_DECIDING_FRAMES).round().int().tolist()))
+    # Frames of a recording that are decoded for a decision by edges. Source: chosen on the captures of
+    # tests/data/test_orientation.py, where three to five frames decide 422 of 499 times.
+    places = sorted(set(torch.linspace(0, len(recording) - 1, 5).round().int().tolist()))
     frames = []
     for place in places:
         try:
@@ -255,7 +247,9 @@ def _lies_turned(recording: Recording, stored: StoredSizes, k: int, by_display: 
         return by_display  # a half turn or a mirror shows hardly in K: whoever turned depth turned K
     (x, y), (h, w) = _load(recording, 0).camera.c[0].tolist(), stored.hw
     misfit, turned_misfit = (max(abs(x - (b - 1) / 2) / b, abs(y - (a - 1) / 2) / a) for a, b in ((h, w), (w, h)))
-    if abs(misfit - turned_misfit) < _MIN_MISFIT_DIFFERENCE:
+    # Difference of the offsets of K's principal point from the centres of the stored and the turned picture, in image
+    # sizes, below which K does not show how it lies. Source: derived: offsets of real cameras are within 0.05.
+    if abs(misfit - turned_misfit) < 0.05:
         return by_display
     return turned_misfit < misfit
 

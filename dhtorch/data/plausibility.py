@@ -14,24 +14,13 @@ from torch import Tensor
 
 from dhtorch.data.units import DepthUnit, format_unit
 
-#: Returns per map that are examined, rows evenly spaced. Limits the time to 5 ms per map.
-_MAX_VALUES_PER_MAP: Final = 12_000
-
-#: Fewest returns of all maps for a statement. Source: origin not recorded.
+#: Fewest returns of all maps for a statement.
 _MIN_VALUES: Final = 500
 
-#: Median depth in m above which integer codes are doubted, and metres stored as floats: the reach of structured light,
-#: time of flight and stereo with a short baseline, and outdoor scenes of simulators. Source: chosen on the captures of
-#: DHTORCH_DATA, whose medians without sparse sets are at most 4 m.
-_MAX_MEDIAN_CODES_M: Final = 12.0
+#: Median depth in m above which metres stored as floats are doubted: outdoor scenes of simulators.
 _MAX_MEDIAN_FLOATS_M: Final = 100.0
 
-#: Median depth in m below which depth is doubted: with an assumed unit, and otherwise. Source: minimum range of depth
-#: cameras, 0.1 to 0.5 m; r3d_door of DHTORCH_DATA, whose format states metres, has a median of 0.21 m.
-_MIN_MEDIAN_ASSUMED_M: Final = 0.2
-_MIN_MEDIAN_M: Final = 0.05
-
-#: Median depth in m to which a likelier unit leads. Source: origin not recorded; rooms and table tops.
+#: Median depth in m to which a likelier unit leads: rooms and table tops.
 _LIKELY_MEDIAN_M: Final = (0.3, 8.0)
 
 #: Factors on the unit that are tried, in this order. Source: the units of FORMATS and the usual confusions: 1/10000 m
@@ -41,25 +30,6 @@ _UNIT_FACTORS: Final = (0.1, 10.0, 0.2, 5.0, 0.01, 100.0, 0.001, 1000.0)
 #: Shifts of codes in bits that are looked for, and the share of codes that must be such multiples: rotated codes of
 #: depths beyond 8191 are not. Source: SUN3D and SUN RGB-D rotate 16-bit codes by three bits; by chance 1/8 are such.
 _CODE_SHIFTS: Final = (8, 7, 6, 5, 4, 3)
-_MIN_SHIFTED_SHARE: Final = 0.98
-
-#: Ratio of the step between neighbouring pixels, codes / byte-swapped codes, from which the bytes are swapped.
-#: Source: chosen on the captures of DHTORCH_DATA: at most 0.41 as they are, at least 2.4 with swapped bytes.
-_MIN_SWAP_RATIO: Final = 1.5
-
-#: Most different values of 8-bit depth. Source: derived, 2^8.
-_MAX_8_BIT_VALUES: Final = 256
-#: Relative step of 8-bit depth from which it is reported, and the share of steps that are equal up to one code:
-#: disparities have steps that grow with depth. Source: chosen on 7-Scenes and TUM fr1 of DHTORCH_DATA, which have 240
-#: to 360 values; below 0.4 of their steps are equal.
-_MIN_8_BIT_STEP_REL: Final = 0.004
-_MIN_EQUAL_STEPS: Final = 0.7
-
-#: Values that a z-buffer in [0, 1] has in scenes beyond ten near planes: 1 - near / depth. Source: derived, 1 - 1/10.
-_MIN_Z_BUFFER: Final = 0.9
-#: Share of the values that lie there, and least value of the farthest hundredth. Source: origin not recorded.
-_MIN_Z_BUFFER_SHARE: Final = 0.95
-_MIN_Z_BUFFER_FAR: Final = 0.97
 
 
 class PlausibilityFinding(NamedTuple):
@@ -80,7 +50,9 @@ def plausibility_findings(
     ``unit`` None: the format defines metres. A unit of 1 m, and None, mean that the values may be floats; any other
     that they were integers.
     """
-    maps = [_thin_rows(depth.detach()).cpu().double() for depth in depths if depth.numel()]
+    # Evenly spaced rows, in which neighbours stay neighbours; 12,000 values of a map take 5 ms.
+    thin = (depth.detach()[:: max(1, -(-depth.numel() // 12_000))] for depth in depths if depth.numel())
+    maps = [depth.cpu().double() for depth in thin]
     values = torch.cat([x[x > 0] for x in maps]) if maps else torch.zeros(0, dtype=torch.float64)
     if values.numel() < _MIN_VALUES:
         return []
@@ -97,15 +69,14 @@ def plausibility_findings(
     return [] if finding is None else [finding]
 
 
-def _thin_rows(depth: Tensor) -> Tensor:
-    """Evenly spaced rows of a map (h, w): neighbours within a row stay neighbours."""
-    return depth[:: max(1, -(-depth.numel() // _MAX_VALUES_PER_MAP))]
-
-
 def _check_median(values: Tensor, unit: DepthUnit | None, sparse: bool) -> PlausibilityFinding | None:
     median, metres = float(values.median()), 1.0 if unit is None else unit.metres
-    high = _MAX_MEDIAN_FLOATS_M if metres >= 1 or sparse else _MAX_MEDIAN_CODES_M
-    low = _MIN_MEDIAN_ASSUMED_M if unit is not None and unit.is_assumed else _MIN_MEDIAN_M
+    # Integer codes are doubted beyond the reach of structured light, time of flight and stereo with a short baseline.
+    # Source: chosen on the captures of DHTORCH_DATA, whose medians without sparse sets are at most 4 m.
+    high = _MAX_MEDIAN_FLOATS_M if metres >= 1 or sparse else 12.0
+    # Median depth in m below which depth is doubted: with an assumed unit, and otherwise. Source: minimum range of
+    # depth cameras, 0.1 to 0.5 m; r3d_door of DHTORCH_DATA, whose format states metres, has a median of 0.21 m.
+    low = 0.2 if unit is not None and unit.is_assumed else 0.05
     if low <= median <= high:
         return None
     if median > high:
@@ -119,23 +90,18 @@ def _check_median(values: Tensor, unit: DepthUnit | None, sparse: bool) -> Plaus
         return PlausibilityFinding("unit", f"{text}{read_as}: wrong depth unit?", "data.depth_unit=…")
     likelier = metres * likely[0]
     text = f"{text}{read_as}: depth unit {format_unit(likelier)}?"
-    return PlausibilityFinding("unit", text, f"data.depth_unit={_format_option(likelier)}")
-
-
-def _format_option(metres: float) -> str:
-    """A unit as the value of the option ``depth_unit``."""
-    return format_unit(metres).removesuffix(" m")
+    return PlausibilityFinding("unit", text, f"data.depth_unit={format_unit(likelier).removesuffix(' m')}")
 
 
 def _check_shifted(values: Tensor, metres: float) -> PlausibilityFinding | None:
     codes = (values / metres).round().long()
-    shifts = [n for n in _CODE_SHIFTS if float((codes % 2**n == 0).double().mean()) >= _MIN_SHIFTED_SHARE]
+    shifts = [n for n in _CODE_SHIFTS if float((codes % 2**n == 0).double().mean()) >= 0.98]
     if not shifts or bool((codes == codes[0]).all()):
         return None
     n = shifts[0]
     where = ", as SUN3D and SUN RGB-D rotate them" if n == 3 else ""
     text = f"depth codes are multiples of {2**n}: shifted by {n} bits{where}?"
-    return PlausibilityFinding("shifted", text, f"data.depth_unit={_format_option(metres / 2**n)}")
+    return PlausibilityFinding("shifted", text, f"data.depth_unit={format_unit(metres / 2**n).removesuffix(' m')}")
 
 
 def _check_byte_order(codes: Sequence[Tensor]) -> PlausibilityFinding | None:
@@ -151,7 +117,9 @@ def _check_byte_order(codes: Sequence[Tensor]) -> PlausibilityFinding | None:
         return None
     # Means of capped steps: medians of piecewise constant maps are 0, and steps at edges outweigh the rest in sums.
     stored, swapped = (step.clamp_max(1000) + 0.1).log().mean(1).exp().tolist()
-    if stored < _MIN_SWAP_RATIO * swapped:
+    # Ratio of the step between neighbouring pixels, codes / byte-swapped codes, from which the bytes are swapped.
+    # Source: chosen on the captures of DHTORCH_DATA: at most 0.41 as they are, at least 2.4 with swapped bytes.
+    if stored < 1.5 * swapped:
         return None
     ratio = stored / swapped
     text = f"neighbouring depths differ {ratio:.0f} times as much as with swapped bytes: codes of the other byte order?"
@@ -160,12 +128,16 @@ def _check_byte_order(codes: Sequence[Tensor]) -> PlausibilityFinding | None:
 
 def _check_8_bit(values: Tensor, metres: float) -> PlausibilityFinding | None:
     codes = (values / metres).round().unique()
-    if not 2 < len(codes) <= _MAX_8_BIT_VALUES:
+    # Most different values of 8-bit depth. Source: derived, 2^8.
+    if not 2 < len(codes) <= 256:
         return None
     gap = codes.diff()
     step = float(gap.median())
     equal = float(((gap - step).abs() <= 1).double().mean())
-    if step * metres < _MIN_8_BIT_STEP_REL * float(values.median()) or equal < _MIN_EQUAL_STEPS or step < 3:
+    # Relative step of 8-bit depth from which it is reported, and the share of steps that are equal up to one code:
+    # disparities have steps that grow with depth. Source: chosen on 7-Scenes and TUM fr1 of DHTORCH_DATA, which have
+    # 240 to 360 values; below 0.4 of their steps are equal.
+    if step * metres < 0.004 * float(values.median()) or equal < 0.7 or step < 3:
         return None
     text = f"only {len(codes)} different depths in equal steps of {step * metres:.3g} m: 8-bit depth?"
     return PlausibilityFinding("8_bit", text, "export depth with 16 bits or as floats")
@@ -174,8 +146,11 @@ def _check_8_bit(values: Tensor, metres: float) -> PlausibilityFinding | None:
 def _check_z_buffer(values: Tensor) -> PlausibilityFinding | None:
     if float(values.max()) > 1:
         return None
-    share = float((values >= _MIN_Z_BUFFER).double().mean())
-    if share < _MIN_Z_BUFFER_SHARE or float(values.quantile(0.99)) < _MIN_Z_BUFFER_FAR:
+    # Values that a z-buffer in [0, 1] has in scenes beyond ten near planes: 1 - near / depth. Source: derived, 1 -
+    # 1/10.
+    share = float((values >= 0.9).double().mean())
+    # Share of the values that lie there, and least value of the farthest hundredth.
+    if share < 0.95 or float(values.quantile(0.99)) < 0.97:
         return None
     low, high = values.quantile(torch.tensor([0.01, 0.99], dtype=values.dtype)).tolist()
     text = f"depth values from {low:.4f} to {high:.4f}, none above 1: z-buffer (non-linear depth)?"

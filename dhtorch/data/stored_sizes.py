@@ -17,7 +17,7 @@ EXIF_SYMMETRIES: Final = {1: 0, 2: 4, 3: 2, 4: 6, 5: 7, 6: 1, 7: 5, 8: 3}
 #: What is expected of depth, in error messages.
 SAME_ORIENTATION: Final = "depth and pictures in one orientation"
 
-#: Relative difference of aspect ratios up to which they count as equal. Source: origin not recorded.
+#: Relative difference of aspect ratios up to which they count as equal.
 _MAX_ASPECT_DIFFERENCE = 0.05
 
 

@@ -23,16 +23,6 @@ _DEPTH_PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 
 #: Total translation (m) and rotation (rad) below which a trajectory counts as constant.
 _MIN_MOTION_M = 1e-3
-_MIN_MOTION_RAD = 1e-3
-
-#: Speed in m/s above which a step of the trajectory counts as a jump: hand-held cameras do not move so fast.
-_MAX_SPEED_M_S = 5.0
-
-#: Fraction of a depth map's pixels without depth above which a warning is issued.
-_MAX_HOLE_RATIO = 0.5
-
-#: Depth values per frame that enter the percentiles.
-_MAX_SAMPLED_VALUES = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +166,7 @@ def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", spars
     out.add_fact("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
     out.add_fact("holes", _format_range([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
-    values = torch.cat([_subsample(d[d > 0]) for d in depths])
+    values = torch.cat([x[:: max(1, -(-x.numel() // 200_000))] for x in (d[d > 0] for d in depths)])
     out.depths = values
     if values.numel() == 0:
         out.warn("no depth at all in the frames that were read")
@@ -188,14 +178,11 @@ def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", spars
     empty = int((holes == 1).sum())
     if empty:
         out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
-    elif float(holes.mean()) > _MAX_HOLE_RATIO and not sparse:
+    # Fraction of a depth map's pixels without depth above which a warning is issued.
+    elif float(holes.mean()) > 0.5 and not sparse:
         out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
     if float(values.max() - values.min()) < 1e-3:
         out.warn("depth is the same everywhere")
-
-
-def _subsample(values: Tensor) -> Tensor:
-    return values[:: max(1, -(-values.numel() // _MAX_SAMPLED_VALUES))]
 
 
 def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
@@ -256,21 +243,18 @@ def _report_poses(recording: Recording, out: Survey) -> None:
     step = poses.t.diff(dim=0).norm(dim=-1)
     rotation = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
     extent = float((poses.t.amax(0) - poses.t.amin(0)).norm())
-    length, total_deg = float(step.sum()), _to_degrees(rotation.sum())
+    length, total_deg = float(step.sum()), math.degrees(float(rotation.sum()))
     out.add_fact("path", f"{length:.3f} m long inside a box of {extent:.3f} m, {total_deg:.1f}° of turning")
-    median = f"{float(step.median()):.4f} m and {_to_degrees(rotation.median()):.2f}° from frame to frame"
+    median = f"{float(step.median()):.4f} m and {math.degrees(float(rotation.median())):.2f}° from frame to frame"
     out.add_fact("step", f"{median}, at most {float(step.max()):.3f} m")
-    if float(step.sum()) < _MIN_MOTION_M and float(rotation.sum()) < _MIN_MOTION_RAD:
+    if float(step.sum()) < _MIN_MOTION_M and float(rotation.sum()) < 1e-3:
         out.warn("poses are constant")
     elif extent < _MIN_MOTION_M:
         out.warn("the camera turns but does not move: there is no baseline")
     if recording.times is not None:
         speed = step / recording.times.diff().clamp(min=1e-9)
         out.add_fact("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
-        if float(speed.max()) > _MAX_SPEED_M_S and not recording.sparse:
+        # Speed in m/s above which a step of the trajectory counts as a jump: hand-held cameras do not move so fast.
+        if float(speed.max()) > 5.0 and not recording.sparse:
             number = int(recording.number[int(speed.argmax()) + 1])
             out.warn(f"the camera jumps: {float(speed.max()):.1f} m/s at frame {number}")
-
-
-def _to_degrees(angle: Tensor) -> float:
-    return math.degrees(float(angle))

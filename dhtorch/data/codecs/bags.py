@@ -44,7 +44,6 @@ _MAX_HEADER_BYTES: Final = 1 << 20  # of a schema, channel or header of a record
 _DATABASE_ROW: Final = -2  # chunk of a message in a database
 _COLUMNS: Final = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"id", "topic_id", "data"}}
 _MAX_TOPICS: Final = 100_000  # of a database
-_MAX_QUERY_S: Final = 15.0  # s, of one query; opening a capture may take 20
 
 
 class Topic(NamedTuple):
@@ -334,7 +333,8 @@ def _open_database(file: Path) -> Iterator[sqlite3.Connection]:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_FILE_BYTES)
             database.execute("PRAGMA trusted_schema = OFF")
             database.execute("PRAGMA mmap_size = 0")
-            end = time.monotonic() + _MAX_QUERY_S
+            # Opening a capture may take 20 s.
+            end = time.monotonic() + 15.0
             database.set_progress_handler(lambda: int(time.monotonic() > end), 100_000)  # steps between looks
             for table, expected in _COLUMNS.items():
                 row = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchone()

@@ -31,9 +31,6 @@ COLMAP_LENSES = {
 #: Numbers of these models in binary files → names. Source: COLMAP, sensor/models.h.
 _BINARY_LENSES = dict(zip((0, 1, 2, 3, 4, 6), COLMAP_LENSES, strict=True))
 
-#: Most images of a text model, as a bound for damaged files.
-_MAX_IMAGES = 1_000_000
-
 
 @dataclass(frozen=True, eq=False)
 class ColmapLens:
@@ -180,7 +177,8 @@ def _text_images(file: Path) -> Iterator[_Image]:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
         words = text.split(maxsplit=9)
-        if len(words) != 10 or n >= _MAX_IMAGES:
+        # Most images of a text model, as a bound for damaged files.
+        if len(words) != 10 or n >= 1_000_000:
             raise FormatError(file, f"line {line}", f"{len(words)} columns", "IMAGE_ID, QW … TZ, CAMERA_ID, NAME")
         pose = ColmapNumbers(line - 1, np.array(parse_numbers(words[1:8], 7, file, line)))
         seen = _TextObservations(lines[line] if line < len(lines) else "", line + 1)

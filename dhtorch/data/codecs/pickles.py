@@ -31,7 +31,6 @@ from dhtorch.data.pickled_arrays import (
 )
 from dhtorch.runtime import safe_open
 
-_MAX_PICKLE_BYTES: Final = 128_000_000
 _MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle
 _MAX_NESTING: Final = 32  # containers inside containers
 
@@ -53,7 +52,7 @@ def read_npy(file: Path) -> Any:
     Raises:
         FormatError: missing or damaged file, or a pickle with any other content or call.
     """
-    data = read_bytes(file, _MAX_PICKLE_BYTES)
+    data = read_bytes(file, 128_000_000)
     shape, fortran, dtype, start = parse_npy_header(file, "header", data)
     body = data[start:]
     if dtype.hasobject:

@@ -17,7 +17,6 @@ from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular, unreadable_e
 
 _BLOCK_BYTES = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
-_MAX_SIZE_DIGITS = 18  # of a size in a pax header
 _FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
 _KINDS_WITHOUT_DATA = b"123456"  # links, devices, folders: their declared size is ignored
 
@@ -99,7 +98,7 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
 
 def _parse_pax_size(file: Path, text: str, at: int) -> int:
     """The size in a pax header."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_SIZE_DIGITS):
+    if not (text.isascii() and text.isdecimal() and len(text) <= 18):
         raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
     return int(text)
 

@@ -29,9 +29,6 @@ from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, check_memory, open_regular
 
 _MAX_VIDEO_PIXELS = 36_000_000  # pixels, 8K; a decoder holds up to 17 frames
 _MAX_FRAMES = 10_000_000
-_MAX_OPEN_DECODERS = 8  # decoders in a process
-_MAX_FAILED_PACKETS = 100  # consecutive undecodable packets after which decoding stops
-_MAX_DECODE_AHEAD_FRAMES = 60  # frames up to which decoding on is cheaper than seeking a key frame
 
 #: Types of the first box of an mp4.
 _MP4_FIRST_BOXES: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
@@ -39,7 +36,6 @@ _CONTAINER_BOXES: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof",
 #: Box -> offset in it of a number of samples.
 _COUNT_AT: Final = {b"stsz": 8, b"stz2": 8, b"trun": 4}
 _RUN_LENGTH_BOXES: Final = (b"stts", b"ctts")  # tables of (count, value)
-_BYTES_PER_SAMPLE: Final = 200  # memory of a decoder and of our table per sample
 _MAX_DEPTH, _MAX_BOXES = 12, 200_000  # of an mp4
 #: (a, b, c, d) of a track's matrix, x' = a x + c y and y' = b x + d y in an image with y down -> symmetry of
 #: :mod:`dhtorch.data.orientation`.
@@ -251,7 +247,8 @@ def _inspect_mp4(stream: BinaryIO, file: Path, track: int) -> int:
         if declared > total:
             raise FormatError(file, kind.decode(), f"{declared} samples in {total} bytes", "at most one per byte")
         most = max(n_samples, declared)
-        check_memory(file, "samples", _BYTES_PER_SAMPLE * most, f"{most} samples")
+        # Memory of a decoder and of our table per sample.
+        check_memory(file, "samples", 200 * most, f"{most} samples")
     return symmetries[track] if track < len(symmetries) else 0
 
 
@@ -341,7 +338,8 @@ class _Decoder:
         if not 0 <= i < len(pts):
             raise FormatError(self.file, f"frame {i}", f"{len(pts)} frames", f"{self.header.n} frames")
         try:
-            if not 0 <= self.next <= i <= self.next + _MAX_DECODE_AHEAD_FRAMES:
+            # Frames up to which decoding on is cheaper than seeking a key frame.
+            if not 0 <= self.next <= i <= self.next + 60:
                 self._seek(int(pts[i]))
             for frame in self.frames:
                 if frame.pts is None or frame.pts < pts[i]:
@@ -371,7 +369,8 @@ class _Decoder:
                 frames = packet.decode()
             except self.errors:
                 failed += 1
-                if failed > _MAX_FAILED_PACKETS:
+                # Consecutive undecodable packets after which decoding stops.
+                if failed > 100:
                     raise
                 continue
             failed = 0
@@ -386,7 +385,8 @@ def _get_decoder(file: Path, all_frames: bool, track: int) -> _Decoder:
     """A cached decoder of this process, opened if needed."""
     key = (file, all_frames, track, read_version(file))
     if key not in _open_decoders:
-        while len(_open_decoders) >= _MAX_OPEN_DECODERS:
+        # Decoders in a process.
+        while len(_open_decoders) >= 8:
             _open_decoders.popitem(last=False)[1].container.close()
         _open_decoders[key] = _Decoder(file, all_frames, track)
     _open_decoders.move_to_end(key)

@@ -11,9 +11,7 @@ from dhtorch.runtime.safe_open import check_memory
 
 _END_RECORD, _ZIP64_LOCATOR, _ZIP64_END = b"PK\x05\x06", b"PK\x06\x07", b"PK\x06\x06"
 _END_RECORD_BYTES, _ZIP64_LOCATOR_BYTES, _ZIP64_END_BYTES = 22, 20, 56
-_MAX_COMMENT_BYTES = 1 << 16
 _MIN_ENTRY_BYTES = 46  # size of an entry in the directory without its name
-_MEMORY_PER_ENTRY_BYTES = 1200  # memory that Python takes per entry
 
 
 def check_zip_directory(stream: BinaryIO, file: Path) -> None:
@@ -23,7 +21,7 @@ def check_zip_directory(stream: BinaryIO, file: Path) -> None:
         FormatError: no end record, a directory larger than the archive, or too many entries.
     """
     total = stream.seek(0, 2)
-    tail_at = max(0, total - _MAX_COMMENT_BYTES - _END_RECORD_BYTES)
+    tail_at = max(0, total - (1 << 16) - _END_RECORD_BYTES)
     stream.seek(tail_at)
     tail = stream.read()
     at = tail.rfind(_END_RECORD)
@@ -40,9 +38,10 @@ def check_zip_directory(stream: BinaryIO, file: Path) -> None:
             (size,) = struct.unpack_from("<Q", record, 40)
     if size > total:
         raise FormatError(file, "directory", f"{size} bytes in an archive of {total}", "a whole zip archive")
+    # Memory that Python takes per entry.
     check_memory(
         file,
         "directory",
-        size // _MIN_ENTRY_BYTES * _MEMORY_PER_ENTRY_BYTES,
+        size // _MIN_ENTRY_BYTES * 1200,
         f"up to {size // _MIN_ENTRY_BYTES} entries",
     )

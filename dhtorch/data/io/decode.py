@@ -28,12 +28,7 @@ from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, FormatError, check_memory,
 MAX_PIXELS = 64_000_000
 #: Suffixes of images, tried where a format may leave out theirs.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-#: Numbers shown in an error message.
-_MAX_NUMBERS_SHOWN = 64
 
-#: Upper bounds of the memory of Python objects in bytes: per line and per word of a table.
-_LINE_BYTES = 250
-_WORD_BYTES = 64
 #: The same for a JSON document: per object, list, string and entry, counted by their characters.
 _JSON_BYTES = {"{": 240, "[": 64, '"': 32, ",": 40}
 
@@ -41,17 +36,11 @@ _JSON_BYTES = {"{": 240, "[": 64, '"': 32, ",": 40}
 _JPEG_APP1 = 0xE1
 _EXIF_ORIENTATION = 0x0112
 _EXIF_SHORT = 3
-_MAX_EXIF_BYTES = 65_536
 
 _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 
 #: Largest expansion of deflate: 1032 bytes from one.
 MAX_DEFLATE_RATIO = 1032
-#: Largest number of pixels per byte of a JPEG: a block of pixels from one bit.
-_MAX_JPEG_PIXELS_PER_BYTE = 8 * 1024
-#: Limits of a progressive JPEG: number of scans, and pixels summed over all scans.
-_MAX_SCANS = 1000
-_MAX_SCANNED_PIXELS = 20 * MAX_PIXELS
 
 
 class ImageHeader(NamedTuple):
@@ -191,7 +180,8 @@ def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageH
             file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "a whole file"
         )
     scans = data.count(b"\xff\xda") if header.kind == "jpeg" else 1
-    if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED_PIXELS):
+    # Limits of a progressive JPEG: number of scans, and pixels summed over all scans.
+    if scans > 1000 or (scans > 1 and scans * header.hw[0] * header.hw[1] > 20 * MAX_PIXELS):
         raise FormatError(
             file, "scans", f"{scans} scans of {_format_size(header.hw)} pixels", "an image with fewer scans"
         )
@@ -209,9 +199,8 @@ def _parse_header(file: Path, data: bytes) -> ImageHeader:
         raise FormatError(file, "content", f"{data[:8]!r}", "a PNG or JPEG image")
     if not 0 < header.hw[0] * header.hw[1] <= MAX_PIXELS:
         raise FormatError(file, "size", _format_size(header.hw), f"1 to {MAX_PIXELS} pixels")
-    if header.hw[0] * header.hw[1] > len(data) * (
-        _MAX_JPEG_PIXELS_PER_BYTE if header.kind == "jpeg" else 8 * MAX_DEFLATE_RATIO
-    ):
+    # Largest number of pixels per byte of a JPEG: a block of pixels from one bit.
+    if header.hw[0] * header.hw[1] > len(data) * (8 * 1024 if header.kind == "jpeg" else 8 * MAX_DEFLATE_RATIO):
         raise FormatError(
             file, "size", f"{_format_size(header.hw)} in {len(data)} bytes", "enough bytes for its pixels"
         )
@@ -237,7 +226,7 @@ def _png_orientation(data: bytes) -> int:
     while at + 12 <= len(data):
         length, kind = struct.unpack(">I4s", data[at : at + 8])
         if kind == b"eXIf":
-            return _parse_exif_orientation(data[at + 8 : at + 8 + min(length, _MAX_EXIF_BYTES)])
+            return _parse_exif_orientation(data[at + 8 : at + 8 + min(length, 65_536)])
         at += 12 + length
     return 1
 
@@ -337,9 +326,8 @@ def read_lines(file: Path) -> list[str]:
     """
     text = read_text(file)
     lines, words = (sum(map(text.count, marks)) for marks in (_LINE_ENDS, " ,\t"))
-    check_memory(
-        file, "text", _LINE_BYTES * lines + _WORD_BYTES * words, f"{lines} lines with {words} gaps between words"
-    )
+    # Upper bounds of the memory of Python objects in bytes: per line and per word of a table.
+    check_memory(file, "text", 250 * lines + 64 * words, f"{lines} lines with {words} gaps between words")
     return text.splitlines()
 
 
@@ -401,7 +389,8 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     except (TypeError, ValueError, OverflowError):
         raise FormatError(file, field, repr(value), expected) from None
     if array.shape != shape or not np.isfinite(array).all():
-        actual = array.tolist() if array.size <= _MAX_NUMBERS_SHOWN else f"numbers of shape {array.shape}"
+        # Numbers shown in an error message.
+        actual = array.tolist() if array.size <= 64 else f"numbers of shape {array.shape}"
         raise FormatError(file, field, actual, expected)
     return array
 
@@ -442,11 +431,8 @@ def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
 def natural_sort_key(name: Path | str) -> tuple[object, ...]:
     """Sort key for natural order (1, 2, 10), with or without leading zeros."""
     parts = re.split(r"(\d+)", str(name))
-    return tuple((not part.isdecimal(), int(part[:_MAX_NUMBER_DIGITS]) if part.isdecimal() else part) for part in parts)
-
-
-#: Digits of a number in a file's name that are used.
-_MAX_NUMBER_DIGITS = 300
+    # Digits of a number in a file's name that are used.
+    return tuple((not part.isdecimal(), int(part[:300]) if part.isdecimal() else part) for part in parts)
 
 
 def format_left_out(names: Sequence[int | str], why: str) -> list[str]:

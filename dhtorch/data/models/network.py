@@ -25,9 +25,6 @@ _ARRAY_NAMES = {
 }
 _TEXT_NAMES = ("names", "image_names", "image_paths")
 
-#: Share of the pixels of a network's map that is left out, those of least confidence. Source: origin not recorded.
-_LEAST_CONFIDENT_SHARE = 0.25
-
 
 def read_network_model(root: Path, archives: Sequence[Path], pictures: Path | None) -> SceneModel:
     """Open one archive with all views along the first axis, or one archive for each view.
@@ -106,7 +103,8 @@ def _views_of_arrays(
             z = ((maps[k] - c2w[k, :3, 3]) @ c2w[k, :3, :3])[..., 2]
         z = np.where(np.isfinite(z) & (z > 0), z, 0.0)
         if conf is not None:
-            z[conf[k] < np.quantile(conf[k], _LEAST_CONFIDENT_SHARE)] = 0
+            # The pixels of least confidence are left out.
+            z[conf[k] < np.quantile(conf[k], 0.25)] = 0
         name = f"{k:06d}" if names is None else names[k]
         image = name if isinstance(name, Path) else find_picture(archive.parent, Path(name).name, None)
         yield ModelView(Path(name).name, K[k], (z.shape[0], z.shape[1]), c2w[k], image=image, depth=z)

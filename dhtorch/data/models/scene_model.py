@@ -21,7 +21,7 @@ from dhtorch.runtime.ply import PlyVertices, read_ply_vertices
 from dhtorch.runtime.safe_open import check_link, check_regular_file, restrict_links
 
 #: A model point is seen in a picture unless another one is nearer by this fraction within a cell of so many cells
-#: across. Source: origin not recorded.
+#: across.
 _OCCLUSION_REL, _OCCLUSION_CELLS = 0.05, 48
 
 

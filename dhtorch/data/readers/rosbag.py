@@ -54,9 +54,6 @@ _NO_COLOUR: Final = re.compile(r"depth|infra|(^|[/_])ir([/_\d]|$)|confidence|dis
 _COLOUR: Final = re.compile(r"color|colour|rgb")
 _SDK_IMAGE: Final = re.compile(r"(/device_\d+/sensor_\d+)/\w+/image/data")
 
-_MILLIMETRE: Final = 0.001  # m of a code of 16UC1. Source: REP 118
-_MIN_POSED_SHARE: Final = 0.5  # of the frames, below which the poses are left out instead of the frames
-
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
@@ -289,7 +286,8 @@ def _depth_unit(bag: BagIndex, depth: ImageStream) -> DepthUnit | None:
     encoding = depth.encoding.partition(";")[0].strip()
     if encoding == "32FC1":
         return None
-    return DepthUnit(_MILLIMETRE, "REP 118: 16UC1" if encoding == "16UC1" else None)
+    # Millimetres. Source: REP 118.
+    return DepthUnit(0.001, "REP 118: 16UC1" if encoding == "16UC1" else None)
 
 
 def _find_poses(
@@ -304,7 +302,8 @@ def _find_poses(
     if trajectory is None:
         return None, pairs, []
     c2w, covered, world = trajectory
-    if covered.mean() < _MIN_POSED_SHARE:
+    # Where less than half of the frames have a pose, the poses are left out instead of the frames.
+    if covered.mean() < 0.5:
         remark = f"transforms of {colour.frame} cover {int(covered.sum())} of {len(covered)} frames: no poses"
         return None, pairs, [remark]
     report = files.format_left_out(pairs[~covered, 0].tolist(), f"no transform of {colour.frame} at its time")

@@ -26,7 +26,6 @@ from dhtorch.runtime.safe_open import check_memory
 _IMAGE_TYPES: Final = {"sensor_msgs/Image": False, "sensor_msgs/CompressedImage": True}  # type → whether compressed
 _NO_DEPTH: Final = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|confidence|disparity|amplitude|label|mask|seg")
 _MAX_NAMES_SHOWN: Final = 12  # topics in a message
-_MESSAGE_BYTES: Final = 300  # memory of a reference and its stamp
 
 
 @dataclass(eq=False)
@@ -86,7 +85,8 @@ def index_bag(root: Path, parts: Sequence[Path]) -> BagIndex:
         for message in iter_messages(file):
             count += 1
             if count % 4096 == 0:
-                check_memory(file, "messages", _MESSAGE_BYTES * count, f"{count} messages")
+                # Memory of a reference and its stamp.
+                check_memory(file, "messages", 300 * count, f"{count} messages")
             _add_message(bag, message)
     for stream in bag.streams.values():  # in the order of the stamps; those never set are the times of recording
         stamps = np.array(stream.stamps_ns if any(stream.stamps_ns) else stream.recorded_ns, np.int64)

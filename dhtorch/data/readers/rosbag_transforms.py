@@ -12,14 +12,8 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data.clocks import interpolate_poses
 
-#: Longest interval in s between two transforms to interpolate in: across longer ones tracking was lost.
-_MAX_GAP_S: Final = 0.5
-#: Largest difference in s of a transform used as it stands.
-_MAX_DIFFERENCE_S: Final = 0.05
-_SAME_S: Final = 1e-6  # difference in s of two equal stamps: double precision keeps 0.2 µs of seconds since 1970
 _MAX_DEPTH: Final = 64  # frames of a chain; a longer one is a circle
 _MAX_TRANSFORMS: Final = 500_000  # kept in memory; about two hours of a robot of 7 joints at 10 Hz
-_FIXED_M: Final = 1e-9  # largest difference of a repeated transform that is taken as fixed
 #: Roots that stand still by their convention (REP 105).
 WORLD_FRAMES: Final = ("map", "odom", "world", "earth")
 
@@ -104,7 +98,8 @@ class TransformTree:
         if not entries or len({entry.parent for entry in entries}) > 1:
             return None
         values = np.array([(*entry.t, *entry.q) for entry in entries])
-        if not np.abs(values - values[0]).max() <= _FIXED_M:
+        # Largest difference of a repeated transform that is taken as fixed.
+        if not np.abs(values - values[0]).max() <= 1e-9:
             return None
         fixed: np.ndarray = convert.to_c2w(values[:1, 3:], values[:1, :3], file, f"transform of {child}")[0]
         return fixed
@@ -116,14 +111,16 @@ def _interpolate(entries: list[Transform], times_ns: np.ndarray, file: Path) -> 
     values = np.array([(*entries[i].t, *entries[i].q) for i in first])
     origin = stamps[0]
     q = values[:, 3:] / np.maximum(np.linalg.norm(values[:, 3:], axis=-1, keepdims=True), 1e-12)
+    # Across gaps of more than half a second tracking was lost; equal stamps may differ by the rounding of seconds since
+    # 1970 in double precision.
     q, t, covered = interpolate_poses(
         (times_ns - origin) / 1e9,
         (stamps - origin) / 1e9,
         q,
         values[:, :3],
-        same=_SAME_S,
-        max_difference=_MAX_DIFFERENCE_S,
-        max_gap=_MAX_GAP_S,
+        same=1e-6,
+        max_difference=0.05,
+        max_gap=0.5,
     )
     q = np.where(covered[:, None], q, [0.0, 0, 0, 1])
     return convert.to_c2w(q, t, file, f"transform of {entries[0].child}"), covered
