@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -95,3 +96,22 @@ def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
         joined.add(replace(part, examples=[example for example in part.examples if example.scene not in known]))
         joined.summary |= part.summary
     return joined
+
+
+#: Number of a summary → (least, largest) value of its bar.
+Bars = Mapping[str, tuple[float, float]]
+
+
+def judge_bars(summary: Mapping[str, Any], bars: Bars) -> tuple[bool | None, str]:
+    """(all bars met, None if undecided; the bars that are missed and the numbers that are undefined)."""
+    values = {name: summary.get(name, {}).get("value") for name in bars}
+    defined = {name: value for name, value in values.items() if value is not None}
+    missed = [
+        f"{name} {value:.3f} (bar {', '.join(f'{end:g}' for end in bars[name] if math.isfinite(end))})"
+        for name, value in defined.items()
+        if not bars[name][0] <= value <= bars[name][1]
+    ]
+    undefined = [name for name in bars if name not in defined]
+    notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
+    why = "; ".join([f"{len(defined) - len(missed)} of {len(defined)} bars met", *missed, *notes])
+    return (None if undefined and not missed else not missed), why

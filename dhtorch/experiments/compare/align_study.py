@@ -16,7 +16,8 @@ sensor here: a near-only fit of a rescaled map is nearly exact, more than a netw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import scale_shift
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
@@ -59,14 +60,17 @@ _METRICS = (
 QUESTION = "Does alignment make any depth map as metric as the references allow, and leave a correct map unchanged?"
 EXPECTATION = "Every number of the list of bars is met; scenes are the unit."
 
-#: Number → (bar, whether it holds).
-ALIGN_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "align.simulated_median": (0.02, lambda value, bar: value <= bar),
-    "align.ratio_to_near_affine": (0.5, lambda value, bar: value <= bar),
-    "align.worst_ratio_to_better": (1.05, lambda value, bar: value <= bar),
-    "align.within_sigma": (0.68, lambda value, bar: abs(value - bar) <= 0.07),
-    "align.within_2sigma": (0.90, lambda value, bar: value >= bar),
+#: Number → (least, largest) value.
+ALIGN_BARS: Bars = {
+    "align.simulated_median": (0.0, 0.02),
+    "align.ratio_to_near_affine": (0.0, 0.5),
+    "align.worst_ratio_to_better": (-math.inf, 1.05),
+    "align.within_sigma": (0.61, 0.75),
+    "align.within_2sigma": (0.90, math.inf),
 }
+
+#: (all bars met, or None if one is undefined; the bars that are missed or undefined) of a summary.
+verdict = partial(judge_bars, bars=ALIGN_BARS)
 
 #: Method names in rows: ours, the unaligned map, and the fit to near returns alone.
 _OURS, _RAW, _NEAR_ONLY = "align", "raw", "near least squares"
@@ -156,17 +160,6 @@ def run(
         outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_alignment(outcome.rows, names) | leave_one_scene_out(outcome.rows, names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
-
-
-def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """(all bars met, or None if one is undefined; the bars that are missed or undefined)."""
-    values = {name: summary.get(name, {}).get("value") for name in ALIGN_BARS}
-    if undefined := [name for name, value in values.items() if value is None]:
-        return None, f"not measured: {', '.join(undefined)}"
-    missed = [
-        f"{k} {values[k]:.3f} (bar {bar:g})" for k, (bar, holds) in ALIGN_BARS.items() if not holds(values[k], bar)
-    ]
-    return not missed, "; ".join([f"{len(ALIGN_BARS) - len(missed)} of {len(ALIGN_BARS)} bars met", *missed])
 
 
 def summarise_alignment(rows: Sequence[Row], names: Sequence[str]) -> Row:

@@ -24,7 +24,7 @@ from dhtorch.codes import PinReason, PinVerdict, name
 from dhtorch.data import open_all, scenes_root
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
@@ -85,7 +85,7 @@ PIN_QUESTION = "Does a reference view tell whether its camera was moved, and by 
 PIN_EXPECTATION = "Every number of the list of bars is met; scenes are the unit of fractions."
 
 #: Number → (least, largest) value of its bar.
-PIN_BARS: dict[str, tuple[float, float]] = {
+PIN_BARS: Bars = {
     "pin.found_2px": (0.95, 1.0),
     "pin.false_alarms": (0.0, 0.01),
     "pin.zoom_moved": (0.0, 0.01),
@@ -235,7 +235,7 @@ def run(
     if real:
         outcome.rows += _real_rows(scenes_root(root))
     outcome.summary = summarise_pin(outcome.rows, times)
-    return outcome.decide(PIN_QUESTION, PIN_EXPECTATION, *pin_verdict(outcome.summary))
+    return outcome.decide(PIN_QUESTION, PIN_EXPECTATION, *judge_bars(outcome.summary, PIN_BARS))
 
 
 def _picture_row(scene: FixedScene, pin: CameraPin, move: PlantedMove, share: float, frame: Frame) -> Row:
@@ -343,17 +343,3 @@ def summarise_pin(rows: Sequence[Row], times: Sequence[Mapping[str, float]]) -> 
             counts |= {f"{data}_turned": sum(row["turned"] for row in episodes) / max(known, 1)}
             summary |= {f"pin.{key}": bootstrap.without_interval(float(x), len(episodes)) for key, x in counts.items()}
     return summary
-
-
-def pin_verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
-    values = {key: summary[key]["value"] for key in PIN_BARS if key in summary}
-    missed = [
-        f"{key} {values[key]:.3g} (bar {low:g} to {high:g})"
-        for key, (low, high) in PIN_BARS.items()
-        if key in values and not low <= values[key] <= high
-    ]
-    undefined = [key for key in PIN_BARS if key not in values]
-    notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
-    why = "; ".join([f"{len(values) - len(missed)} of {len(values)} bars met", *missed, *notes])
-    return (None if undefined and not missed else not missed), why

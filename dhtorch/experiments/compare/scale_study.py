@@ -19,6 +19,7 @@ and 7s_redkitchen_stream_000: rooms and models are others here, those two scenes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from dhtorch.data.models import ModelView, SceneModel, Similarity
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import protocol
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
@@ -50,15 +51,15 @@ EXPECTATION = (
 )
 EXPECTATION += "sound refused <= 2 %."
 
-#: Number → (bar, whether a larger value is better).
-SCALE_BARS: dict[str, tuple[float, bool]] = {
-    "scale.far_error": (0.01, False),
-    "scale.within_2sigma": (0.92, True),
-    "scale.faulty_refused": (0.95, True),
-    "scale.sound_refused": (0.02, False),
+#: Number → (least, largest) value.
+SCALE_BARS: Bars = {
+    "scale.far_error": (-math.inf, 0.01),
+    "scale.within_2sigma": (0.92, math.inf),
+    "scale.faulty_refused": (0.95, math.inf),
+    "scale.sound_refused": (-math.inf, 0.02),
 }
 
-_METRICS = tuple(MainMetric(name, larger_is_better=larger) for name, (_, larger) in SCALE_BARS.items())
+_METRICS = tuple(MainMetric(name, larger_is_better=high == math.inf) for name, (_, high) in SCALE_BARS.items())
 
 #: Faults in the order of the rows: relative changes of scale that are planted, beside ``sound``.
 FAULTS = ("drift", "bend", "frames", "range", "region")
@@ -66,10 +67,10 @@ FAULTS = ("drift", "bend", "frames", "range", "region")
 #: Noise of a sensor of whose depths the model itself is made: its own errors cancel.
 _EXACT_SENSOR = SensorNoise(0.0, 0.0, 1e-9)
 
-#: Side of the grid of true depth from which a model is made, px of the longer side. Source: origin not recorded.
+#: Side of the grid of true depth from which a model is made, px of the longer side.
 _MODEL_PX = 160
 
-#: Points of a view in models of points, and the views before and after that observe them. Source: origin not recorded.
+#: Points of a view in models of points, and the views before and after that observe them.
 _POINTS, _OBSERVERS = 300, 3
 
 
@@ -139,19 +140,7 @@ def run(
         outcome.rows += _study(name, case, near_limits, sizes, (sound, repeats), settings.seed)
         outcome.n_pairs += len(case.frames)
     outcome.summary = summarise_scales(outcome.rows)
-    return outcome.decide(QUESTION, EXPECTATION, *_verdict(outcome.summary))
-
-
-def _verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    values = {name: summary.get(name, {}).get("value") for name in SCALE_BARS}
-    if undefined := [name for name, value in values.items() if value is None]:
-        return None, f"not measured: {', '.join(undefined)}"
-    missed = [
-        f"{name} {values[name]:.3f} (bar {bar:g})"
-        for name, (bar, larger) in SCALE_BARS.items()
-        if (values[name] < bar if larger else values[name] > bar)
-    ]
-    return not missed, "; ".join([f"{len(SCALE_BARS) - len(missed)} of {len(SCALE_BARS)} bars met", *missed])
+    return outcome.decide(QUESTION, EXPECTATION, *judge_bars(outcome.summary, SCALE_BARS))
 
 
 def _skip_reason(scene: Scene, near: float | None) -> str | None:

@@ -15,7 +15,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +24,7 @@ from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.baselines import photometric
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, mean_or_none
 from dhtorch.geometry import camera as cam
@@ -59,15 +58,18 @@ _METRICS = (
 QUESTION = "Does validation detect the errors of a depth map, and report unknown where there is no evidence?"
 EXPECTATION = "Every number of the list of bars is met; scenes, and of causes windows, are the unit."
 
-#: Number → (bar, whether it holds).
-VALIDATE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "validate.scale_detected": (0.95, lambda value, bar: value >= bar),
-    "validate.false_alarm": (0.02, lambda value, bar: value <= bar),
-    "validate.jump_auroc": (0.95, lambda value, bar: value >= bar),
-    "validate.called_right_wrong": (0.01, lambda value, bar: value <= bar),
-    "validate.named_worst": (0.90, lambda value, bar: value >= bar),
-    **{f"validate.{cause}_auroc": (0.95, lambda value, bar: value >= bar) for cause in RETURN_FAULTS},
+#: Number → (least, largest) value.
+VALIDATE_BARS: Bars = {
+    "validate.scale_detected": (0.95, math.inf),
+    "validate.false_alarm": (-math.inf, 0.02),
+    "validate.jump_auroc": (0.95, math.inf),
+    "validate.called_right_wrong": (-math.inf, 0.01),
+    "validate.named_worst": (0.90, math.inf),
+    **{f"validate.{cause}_auroc": (0.95, math.inf) for cause in RETURN_FAULTS},
 }
+
+#: (all bars met, or None if undecided; the bars that are missed and the numbers that are undefined) of a summary.
+verdict = partial(judge_bars, bars=VALIDATE_BARS)
 
 #: Scale factors that are planted: name in rows → factor.
 _SCALE_FAULTS = {"10_long": 1.1, "10_short": 1 / 1.1, "5_long": 1.05, "5_short": 1 / 1.05}
@@ -222,21 +224,6 @@ def run(
         outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
     outcome.summary = summarise_validation(outcome.rows)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
-
-
-def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
-    values = {name: summary.get(name, {}).get("value") for name in VALIDATE_BARS}
-    undefined = [name for name, value in values.items() if value is None]
-    defined = {name: value for name, value in values.items() if value is not None}
-    missed = [
-        f"{k} {value:.3f} (bar {VALIDATE_BARS[k][0]:g})"
-        for k, value in defined.items()
-        if not VALIDATE_BARS[k][1](value, VALIDATE_BARS[k][0])
-    ]
-    notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
-    why = "; ".join([f"{len(defined) - len(missed)} of {len(defined)} bars met", *missed, *notes])
-    return (None if undefined and not missed else not missed), why
 
 
 def summarise_validation(rows: Sequence[Row]) -> Row:
