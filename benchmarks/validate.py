@@ -20,7 +20,7 @@ import pair as pairs
 import torch
 
 from dhtorch import MAP, validate_depth
-from dhtorch.experiments.baselines import photometric
+from dhtorch.experiments.compare import validate_study
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
 from dhtorch.validation.validate import QUICK_METHOD
@@ -37,7 +37,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
         trace: dict[str, Any] = {}
         with torch.no_grad():
             selected = dense.selected_views(METHOD(near, other, trace=trace), other, trace)
-            photometric.photometric_difference(reference.depth, near, selected)
+            validate_study.photometric_difference(reference.depth, near, selected)
 
     def ours(method: Method, views: bool) -> None:
         validate_depth(reference.depth, near, other, method=method, views=views)

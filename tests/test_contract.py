@@ -17,7 +17,7 @@ from dhtorch.alignment import (
     residual_noise,
 )
 from dhtorch.experiments.focal import blur, filling, sharpness
-from dhtorch.experiments.negative import arms, clusters, registration
+from dhtorch.experiments.negative import helix_correlation, hole_attention, icp
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.geometry import (
     affine_alignment,
@@ -485,11 +485,11 @@ ROWS = [
     Row(holdout.hide_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
     Row(holdout.require_masked, masked, "dtype batch vmap capture empty shuffle raises", (0, 2), bad=lambda a: (a[0].replace(depth=a[0].depth[:, 1:]), *a[1:])),
     Row(holdout.select_real_holes, lambda b, n, d: (*sampled(b, n, d), holdout.sample_truth(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
-    Row(arms.sample_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
-    Row(arms.correlate_windows, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
-    Row(with_options(registration.register_icp, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
-    Row(with_options(registration.estimate_normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
-    Row(clusters.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
+    Row(helix_correlation.sample_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
+    Row(helix_correlation.correlate_windows, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
+    Row(with_options(icp.register_icp, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(with_options(icp.estimate_normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(hole_attention.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.select_candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
     *(
         Row(clear, lambda b, n, d: (torch.where(frames(b, n, d)[0].depth > 2, 50.0, frames(b, n, d)[0].depth),), POINTLESS, grad=(0,))
@@ -1024,7 +1024,7 @@ def test_another_number_of_points_in_one_argument_raises(row):
 
 
 #: Estimators of the laboratory that keep the promises of a stage.
-ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
+ESTIMATORS = (helix_correlation, hole_attention, icp, blur, filling, sharpness)
 
 
 def public_functions():
@@ -1056,7 +1056,8 @@ def public_functions():
         parts += [importlib.import_module(info.name) for info in found]
     for part in parts:
         for name, fn in inspect.getmembers(part, inspect.isfunction):
-            if not name.startswith("_") and fn.__module__ == part.__name__:
+            experiment = part in ESTIMATORS and name in ("run", "verdict", "make_arms", "consecutive_links")
+            if not name.startswith("_") and fn.__module__ == part.__name__ and not experiment:
                 yield f"{part.__name__}.{name}"
 
 

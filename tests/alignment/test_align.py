@@ -8,7 +8,6 @@ from dhtorch.alignment.error_model import estimate_freedom
 from dhtorch.alignment.options import AlignmentOptions
 from dhtorch.alignment.references import collect_references
 from dhtorch.codes import Gate, Source
-from dhtorch.experiments.baselines import scale_shift
 from dhtorch.experiments.compare import align_study
 from dhtorch.records import DepthMap, Estimate, Samples
 from dhtorch.synthetic import depth_faults
@@ -234,11 +233,11 @@ def test_what_has_an_order_keeps_it():
 
 def test_usual_fits():
     x = torch.linspace(1, 3, 40, dtype=torch.float64)
-    assert scale_shift.fit_scale_shift(x, 2 * x + 0.5) == pytest.approx((2, 0.5))
-    assert scale_shift.fit_median_scale(x, 2 * x) == (2, 0)
+    assert align_study.fit_scale_shift(x, 2 * x + 0.5) == pytest.approx((2, 0.5))
+    assert align_study.fit_median_scale(x, 2 * x) == (2, 0)
     z = 2 * x + 0.5
     z[::4] = 9
-    assert scale_shift.fit_scale_shift_ransac(x, z) == pytest.approx((2, 0.5))
+    assert align_study.fit_scale_shift_ransac(x, z) == pytest.approx((2, 0.5))
 
 
 def test_summary_and_verdict_of_the_study():

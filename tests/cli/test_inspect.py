@@ -31,7 +31,7 @@ from dhtorch.data import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, report_depths, survey_recording
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal.survey import survey_stacks
+from dhtorch.experiments.focal.formats import survey_stacks
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
 

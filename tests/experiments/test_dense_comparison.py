@@ -8,7 +8,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import compare_methods as compare
-from dhtorch.experiments.baselines import filling, stereo
+from dhtorch.experiments.baselines import stereo
 from dhtorch.experiments.compare import dense_comparison
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import se3
@@ -31,7 +31,7 @@ def room():
 @pytest.fixture(scope="module")
 def outcome(room):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(filling, "_N_ROUNDS", 3)
+        patch.setattr(stereo, "_N_ROUNDS", 3)
         return dense_comparison.run(
             [Scene(room, near=NEAR, gap=8)],
             {"map": METHOD},
@@ -142,7 +142,7 @@ def test_flow_is_triangulated_and_bilateral_filling_guesses(pair):
     flow = stereo.match_optical_flow(near, other, T, grid)
     keep = flow.keep & (truth > NEAR)
     assert keep.sum() > 200 and float(((flow.depth - truth).abs() / truth)[keep].median()) < 0.06
-    filled = filling.fill_bilateral(near, grid)
+    filled = stereo.fill_bilateral(near, grid)
     at = grid.usable
     assert bool(filled.keep.all()) and float((filled.depth - truth).abs()[at].median()) < 0.1
     assert bool((filled.score[at].mean() > filled.score[~at].mean()).all()), "what was carried far is less sure"

@@ -19,7 +19,7 @@ from dhtorch import data
 from dhtorch.cli import run
 from dhtorch.data import FormatError
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal.light_field import refocus
+from dhtorch.experiments.focal.ddff12 import refocus
 from dhtorch.experiments.focal.stacks import FocalStacks
 
 ROOT = os.environ.get("DHTORCH_DATA")

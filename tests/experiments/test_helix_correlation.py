@@ -9,7 +9,7 @@ from support.rooms import room_scene
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.negative import helix_correlation as experiment
-from dhtorch.experiments.negative.arms import correlate_windows, sample_arm
+from dhtorch.experiments.negative.helix_correlation import correlate_windows, sample_arm
 from dhtorch.experiments.protocol import Settings
 
 HW = (160, 200)

@@ -6,7 +6,7 @@ from support.paper_protocol_runs import configured_method, small_room
 from support.rooms import Changed
 
 from dhtorch.experiments.negative import hole_attention as experiment
-from dhtorch.experiments.negative.clusters import largest_cluster
+from dhtorch.experiments.negative.hole_attention import largest_cluster
 from dhtorch.experiments.protocol import Settings
 from dhtorch.stages.sample import spiral
 

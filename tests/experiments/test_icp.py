@@ -8,7 +8,7 @@ from support.paper_protocol_runs import configured_method, small_room
 from support.rooms import Changed
 
 from dhtorch.experiments.negative import icp as experiment
-from dhtorch.experiments.negative.registration import estimate_normals, register_icp
+from dhtorch.experiments.negative.icp import estimate_normals, register_icp
 from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
 from dhtorch.records import Pose

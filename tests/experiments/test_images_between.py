@@ -11,8 +11,7 @@ from dhtorch.data.pairs import Pair, by_choice
 from dhtorch.data.rig import join_cameras
 from dhtorch.experiments import protocol
 from dhtorch.experiments.loading import images_between
-from dhtorch.experiments.protocol import Protocol, Settings, Variant
-from dhtorch.experiments.shared_tracks import SharedTracks
+from dhtorch.experiments.protocol import Protocol, Settings, SharedTracks, Variant
 from dhtorch.pipeline.presets import PAPER, PAPER_DIRECT
 from dhtorch.records import TrackHint
 from dhtorch.stages.track_chain import track_chain

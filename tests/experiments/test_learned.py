@@ -12,7 +12,7 @@ from support.rooms import room_scene
 from dhtorch import extend
 from dhtorch.codes import Gate
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments.baselines import dust3r, relative, vggt
+from dhtorch.experiments.baselines import relative
 from dhtorch.experiments.compare import learned
 from dhtorch.experiments.protocol import Settings
 from dhtorch.metrics import holdout
@@ -99,7 +99,7 @@ def installed(monkeypatch, tmp_path):
     return files
 
 
-ADAPTERS = {"dust3r": dust3r.DUSt3R, "vggt": vggt.VGGT}
+ADAPTERS = {"dust3r": relative.DUSt3R, "vggt": relative.VGGT}
 
 
 def ramp(height, width, batch=1):
@@ -229,7 +229,7 @@ def test_networks_are_measured_on_our_candidates(room, installed):
 def test_a_network_is_asked_once_for_all_its_scales(room, installed):
     calls = []
 
-    class Counted(vggt.VGGT):
+    class Counted(relative.VGGT):
         def __call__(self, frame_0, frame_1):
             calls.append(1)
             return super().__call__(frame_0, frame_1)
@@ -253,7 +253,7 @@ def test_the_control_is_worth_its_scale_alone(room, installed):
 @pytest.mark.slow
 def test_without_vggt_nothing_is_decided(room, installed):
     outcome = asked(
-        room, installed, models={"dust3r": partial(dust3r.DUSt3R, weights=installed["dust3r"])}, scales=("oracle",)
+        room, installed, models={"dust3r": partial(relative.DUSt3R, weights=installed["dust3r"])}, scales=("oracle",)
     )
     assert outcome.verdict == "undecided" and "vggt_oracle was not run" in outcome.why
 
@@ -270,4 +270,4 @@ def test_missing_weights_are_named(installed, tmp_path, room):
         with pytest.raises(FileNotFoundError, match="nowhere"):
             adapter(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="same size"):
-        vggt.VGGT(installed["vggt"])(ramp(96, 128), ramp(96, 112))
+        relative.VGGT(installed["vggt"])(ramp(96, 128), ramp(96, 112))

@@ -11,7 +11,7 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import opencv, relative
 from dhtorch.experiments.compare import dense_comparison, learned, method_comparison
 from dhtorch.experiments.focal import blur, defocus_fusion, filling, focus_stack, sharpness
-from dhtorch.experiments.negative import arms, clusters, hole_attention, icp, registration
+from dhtorch.experiments.negative import helix_correlation, hole_attention, icp
 from dhtorch.experiments.paper import latency
 from dhtorch.experiments.probes import learned_score
 from dhtorch.experiments.protocol import Settings
@@ -57,29 +57,38 @@ OPENCV_ALONE = {"paper": PAPER, "opencv": opencv.OPENCV}
         (partial(run, latency, rounds=0), "experiment.rounds"),
         (partial(run, latency, sizes=()), "experiment.sizes"),
         (partial(run, latency, n=0), "experiment.n"),
-        (partial(registration.register_icp, POINTS[:, :0], POINTS, STILL), "expected at least one each"),
-        (partial(registration.register_icp, POINTS, POINTS[:, :0], STILL), "expected at least one each"),
-        (partial(registration.register_icp, POINTS, POINTS, STILL, keep=0.0), "expected keep and shrink"),
-        (partial(registration.register_icp, POINTS, POINTS, STILL, reach_m=0.05), "least_reach_m <= reach_m"),
-        (partial(registration.register_icp, POINTS, POINTS, STILL, normals_1=POINTS[:, :10]), "normals_1 has shape"),
-        (partial(registration.estimate_normals, POINTS[:, :5]), "neighbours"),
+        (partial(icp.register_icp, POINTS[:, :0], POINTS, STILL), "expected at least one each"),
+        (partial(icp.register_icp, POINTS, POINTS[:, :0], STILL), "expected at least one each"),
+        (partial(icp.register_icp, POINTS, POINTS, STILL, keep=0.0), "expected keep and shrink"),
+        (partial(icp.register_icp, POINTS, POINTS, STILL, reach_m=0.05), "least_reach_m <= reach_m"),
+        (partial(icp.register_icp, POINTS, POINTS, STILL, normals_1=POINTS[:, :10]), "normals_1 has shape"),
+        (partial(icp.estimate_normals, POINTS[:, :5]), "neighbours"),
         (
             partial(run, icp, [small_room(hw=(96, 128), n_frames=1)], links=10),
             "found 1 frame of synthetic_room and links",
         ),
-        (partial(arms.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, window=20), "expected odd from 3, and from 1"),
-        (partial(arms.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, window=1), "expected odd from 3, and from 1"),
-        (partial(arms.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, max_lag=0), "expected odd from 3, and from 1"),
         (
-            partial(arms.correlate_windows, SIGNAL[:, :30], SIGNAL, SITE, SITE),
+            partial(helix_correlation.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, window=20),
+            "expected odd from 3, and from 1",
+        ),
+        (
+            partial(helix_correlation.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, window=1),
+            "expected odd from 3, and from 1",
+        ),
+        (
+            partial(helix_correlation.correlate_windows, SIGNAL, SIGNAL, SITE, SITE, max_lag=0),
+            "expected odd from 3, and from 1",
+        ),
+        (
+            partial(helix_correlation.correlate_windows, SIGNAL[:, :30], SIGNAL, SITE, SITE),
             "signals have 30 and 400 steps, expected at",
         ),
         (
-            lambda: clusters.largest_cluster(torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool)),
+            lambda: hole_attention.largest_cluster(torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool)),
             "found 0 samples, expected more than neighbours = 6",
         ),
         (
-            lambda: clusters.largest_cluster(torch.rand(1, 6, 2), torch.zeros(1, 6, dtype=torch.bool)),
+            lambda: hole_attention.largest_cluster(torch.rand(1, 6, 2), torch.zeros(1, 6, dtype=torch.bool)),
             "found 6 samples, expected more than neighbours = 6",
         ),
         (lambda: run(hole_attention, [small_room()], WITHOUT_GAZE), "expected a sampler with an option gaze"),

@@ -26,7 +26,7 @@ from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
-from dhtorch.experiments.baselines import filling, stereo
+from dhtorch.experiments.baselines import stereo
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.outcome import Bars, join_outcomes, judge_bars
 from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
@@ -298,7 +298,7 @@ def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict
         answers |= {
             "sgbm": lambda x: (x.grid, _match_semi_global(x, x.T_1_from_0)),
             "dis flow": lambda x: (x.grid, stereo.match_optical_flow(x.reference, x.other, x.T_1_from_0, x.grid)),
-            "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.reference, x.grid)),
+            "bilateral": lambda x: (x.grid, stereo.fill_bilateral(x.reference, x.grid)),
         }
     variants = {
         name: Variant(method, estimate=partial(cache.estimate, answer), seed=seed, offers=candidate_frames)

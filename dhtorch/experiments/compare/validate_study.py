@@ -23,12 +23,11 @@ from dhtorch.codes import State, WrongCause, describe
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.baselines import photometric
 from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, mean_or_none
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.patches import rescale_field_of_view, sample_nearest
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.detection import auroc
@@ -45,6 +44,35 @@ from dhtorch.synthetic.near_card import add_near_card, card_over_map
 from dhtorch.validation import faults
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.validate import QUICK_METHOD, validate_against
+
+# A fixed-threshold photometric check: the peer of :func:`dhtorch.validation.validate.validate_depth`.
+#
+# A pixel is projected into one source view by its depth and the relative pose; it is wrong if the grey values differ
+# by more than a fixed threshold, else consistent. Texture, baseline, exposure and occlusion are ignored.
+
+#: Difference of grey values in [0, 1] above which a pixel counts as wrong.
+_WRONG_GREY_DIFFERENCE = 0.1
+
+
+@torch.no_grad()
+def photometric_difference(depth: Tensor, reference: Frame, selected: dense.SelectedViews) -> tuple[Tensor, Tensor]:
+    """Depth map (B, h, w) in m → (grey difference to the best source view, states), (B, h, w) each.
+
+    CANNOT_KNOW: no depth, no relative pose, or outside the source image. Gradient: none.
+    """
+    size = max(depth.shape[-2:])
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, size))
+    index, _ = dense.top_views(selected, 1)
+    has_pose = selected.fits.ok.gather(0, index)[0]
+    source_view = dense.source_view_of(selected, index[0], size, has_pose, base.image)
+    inverse_depth = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+    uv, front = plane_sweep.project_inverse_depth(source_view.view, base.ray, inverse_depth.flatten(1))
+    grey, inside = plane_sweep.sample_bilinear(source_view.view.image, uv)
+    visible = (inside & front).unflatten(-1, base.hw) & (depth > 0) & has_pose[:, None, None]
+    difference = (grey[:, 0].unflatten(-1, base.hw) - base.image[:, 0]).abs()
+    state = torch.where(difference > _WRONG_GREY_DIFFERENCE, State.WRONG, State.CONSISTENT)
+    return torch.where(visible, difference, torch.nan), torch.where(visible, state, State.CANNOT_KNOW).to(torch.int32)
+
 
 #: Main metrics of the experiment.
 _METRICS = (
@@ -310,7 +338,7 @@ def _reference_row(
         faulty = true_map if name == "none" else apply_fault(name, true_map, seed=i, other=other_map)[0]
         row |= _validated_counts("", name, faulty, true_map, validate(faulty), has_return)
         row |= _validated_counts("quick_", name, faulty, true_map, validate_quick(faulty, views=False), has_return)
-        difference, state = photometric.photometric_difference(faulty, near, selected)
+        difference, state = photometric_difference(faulty, near, selected)
         row |= {f"peer_{k}": v for k, v in _pixel_counts(name, faulty, true_map, difference, state, has_return).items()}
     row["outline_alarms"] = _outline_alarms(validate(true_map))
     for name in RETURN_FAULTS:

@@ -15,8 +15,7 @@ from dataclasses import fields, replace
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.outcome import join_outcomes
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-from dhtorch.experiments.shared_tracks import stage_key
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant, stage_key
 from dhtorch.metrics import bootstrap
 from dhtorch.stages.sample import regular_grid, vogel_spiral
 
