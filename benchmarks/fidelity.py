@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import reproduce
 
-from dhtorch.experiments.report import published, text
+from dhtorch.experiments.report import text
 from dhtorch.experiments.report.cells import EMPTY_CELL, format_value
-from dhtorch.experiments.report.published import PublishedTable, parse_printed
+from dhtorch.experiments.report.published import PAPER, PublishedTable, parse_printed
 from dhtorch.experiments.report.tables import ReportTable
 
 RESULTS = Path(__file__).parent / "results"
@@ -55,53 +55,53 @@ _GATE_LINES = {
 }
 
 FINDINGS: tuple[Finding, ...] = (
-    Finding(published.LATENCY, "core front end", "p50_ms", "latency", "paper.front_end.224x224"),
-    Finding(published.LATENCY, "DINOv2-L", "p50_ms", "latency", "dinov2_l.forward.224x224"),
-    Finding(published.CROSS_DATA, "TUM RGB-D", "median_rel", "heldout", "paper.median_rel"),
-    Finding(published.CROSS_DATA, "TUM RGB-D", "corr", "heldout", "paper.corr"),
-    Finding(published.CROSS_DATA, "TUM RGB-D", "ece", "calibration", "paper.heldout.ece"),
-    Finding(published.CYCLIC, "in-house", "cyclic", "heldout", "paper.cyclic.median_rel"),
-    Finding(published.CYCLIC, "in-house", "ratio", "heldout", "paper.median_rel / paper.cyclic.median_rel"),
-    *_rows(published.RANGE_SPLIT, "range_split", _RANGE_LINES, ("coverage", "corr", "median_rel", "p90_rel")),
+    Finding(PAPER["latency"], "core front end", "p50_ms", "latency", "paper.front_end.224x224"),
+    Finding(PAPER["latency"], "DINOv2-L", "p50_ms", "latency", "dinov2_l.forward.224x224"),
+    Finding(PAPER["cross_data"], "TUM RGB-D", "median_rel", "heldout", "paper.median_rel"),
+    Finding(PAPER["cross_data"], "TUM RGB-D", "corr", "heldout", "paper.corr"),
+    Finding(PAPER["cross_data"], "TUM RGB-D", "ece", "calibration", "paper.heldout.ece"),
+    Finding(PAPER["cyclic"], "in-house", "cyclic", "heldout", "paper.cyclic.median_rel"),
+    Finding(PAPER["cyclic"], "in-house", "ratio", "heldout", "paper.median_rel / paper.cyclic.median_rel"),
+    *_rows(PAPER["range_split"], "range_split", _RANGE_LINES, ("coverage", "corr", "median_rel", "p90_rel")),
     *_rows(
-        published.REAL_HOLES,
+        PAPER["real_holes"],
         "room_real_holes",
         {"no gates": "no_gates", "gated": "gated"},
         ("coverage", "median_rel", "p90_rel"),
     ),
-    *_rows(published.GATE_ABLATION, "gate_ablation", _GATE_LINES, ("corr", "median_rel")),
+    *_rows(PAPER["gate_ablation"], "gate_ablation", _GATE_LINES, ("corr", "median_rel")),
     Finding(
-        published.HOLE_CENSUS, "indoor", "hole_share.trackable_no_lidar", "hole_census", "hole_share.trackable_no_lidar"
+        PAPER["hole_census"], "indoor", "hole_share.trackable_no_lidar", "hole_census", "hole_share.trackable_no_lidar"
     ),
-    Finding(published.DEVICE_POSE, "device (VIO) pose", "corr", "device_pose", "device_gl_to_cv.corr"),
-    Finding(published.DEVICE_POSE, "device (VIO) pose", "corr", "room_device_pose", "device_raw.corr"),
-    Finding(published.HELIX, "dual-helix correlation", "corr", "helix_correlation", "between_arms.corr"),
-    Finding(published.HELIX, "plain 2-D optical flow", "corr", "helix_correlation", "flow.corr"),
-    Finding(published.ICP, "ICP over it", "n_voxels", "icp", "good + icp points.voxels_vs_pose"),
-    Finding(published.HOLE_ATTENTION, "before", "hole_rate", "hole_attention", "centre.hole_rate"),
+    Finding(PAPER["device_pose"], "device (VIO) pose", "corr", "device_pose", "device_gl_to_cv.corr"),
+    Finding(PAPER["device_pose"], "device (VIO) pose", "corr", "room_device_pose", "device_raw.corr"),
+    Finding(PAPER["helix"], "dual-helix correlation", "corr", "helix_correlation", "between_arms.corr"),
+    Finding(PAPER["helix"], "plain 2-D optical flow", "corr", "helix_correlation", "flow.corr"),
+    Finding(PAPER["icp"], "ICP over it", "n_voxels", "icp", "good + icp points.voxels_vs_pose"),
+    Finding(PAPER["hole_attention"], "before", "hole_rate", "hole_attention", "centre.hole_rate"),
     Finding(
-        published.HOLE_ATTENTION,
+        PAPER["hole_attention"],
         "gaze on the largest hole cluster",
         "hole_rate",
         "hole_attention",
         "attention.hole_rate",
     ),
-    Finding(published.DEFOCUS, "unsigned", "rho_abs", "defocus", "oracle_side.rho_abs"),
-    Finding(published.DEFOCUS, "side from an oracle", "corr", "defocus", "oracle_side.corr"),
-    Finding(published.DEFOCUS, "side has to be produced", "corr", "defocus", "by_height.corr"),
-    Finding(published.FOCUS_STACK, "clean synthetic", "rank_corr", "focus_stack", "clean.rank_corr"),
-    Finding(published.FOCUS_STACK, "clean synthetic", "gated_corr", "focus_stack", "clean.gated_corr"),
-    Finding(published.FOCUS_STACK, "real light fields", "abs_corr", "focus_stack", "light_field.abs_corr"),
-    Finding(published.FOCUS_STACK, "real light fields", "gated_abs_corr", "focus_stack", "light_field.gated_abs_corr"),
-    Finding(published.DEFOCUS_FUSION, "bilinear", "corr", "defocus_fusion", "bilinear.corr"),
-    Finding(published.FUTURE_MOTION, "DH-Active", "vs_dinov2", "rh20t_probe", "dhtorch.vs_dinov2"),
-    Finding(published.FUTURE_MOTION_MOVING, "DH-Active", "vs_dinov2", "rh20t_probe", "dhtorch.moving.vs_dinov2"),
+    Finding(PAPER["defocus"], "unsigned", "rho_abs", "defocus", "oracle_side.rho_abs"),
+    Finding(PAPER["defocus"], "side from an oracle", "corr", "defocus", "oracle_side.corr"),
+    Finding(PAPER["defocus"], "side has to be produced", "corr", "defocus", "by_height.corr"),
+    Finding(PAPER["focus_stack"], "clean synthetic", "rank_corr", "focus_stack", "clean.rank_corr"),
+    Finding(PAPER["focus_stack"], "clean synthetic", "gated_corr", "focus_stack", "clean.gated_corr"),
+    Finding(PAPER["focus_stack"], "real light fields", "abs_corr", "focus_stack", "light_field.abs_corr"),
+    Finding(PAPER["focus_stack"], "real light fields", "gated_abs_corr", "focus_stack", "light_field.gated_abs_corr"),
+    Finding(PAPER["defocus_fusion"], "bilinear", "corr", "defocus_fusion", "bilinear.corr"),
+    Finding(PAPER["future_motion"], "DH-Active", "vs_dinov2", "rh20t_probe", "dhtorch.vs_dinov2"),
+    Finding(PAPER["future_motion_moving"], "DH-Active", "vs_dinov2", "rh20t_probe", "dhtorch.moving.vs_dinov2"),
     *(
-        Finding(published.VISUAL_ODOMETRY, line, metric, name, f"{arm}.{metric}")
+        Finding(PAPER["visual_odometry"], line, metric, name, f"{arm}.{metric}")
         for name in ("vo_probe", "vo_probe_streams")
         for line, arm in (("DH-Active", "dhtorch"), ("DINOv2", "dinov2"))
         for metric in ("mse", "vs_dinov2")
-        if metric in published.VISUAL_ODOMETRY.lines[line]
+        if metric in PAPER["visual_odometry"].lines[line]
     ),
 )
 

@@ -49,7 +49,7 @@ from dhtorch.pipeline.fused import fuse_with_sweep
 from dhtorch.pipeline.presets import AUTO, FUSED
 from dhtorch.pytree import stack
 from dhtorch.synthetic.recording import open_rooms
-from dhtorch.viz.plots import Axis, LegendKey, Panel, Stroke, colours, save_figure
+from dhtorch.viz.plots import colours, make_figure, save_figure, set_axis, set_title
 from dhtorch.viz.viewer import html
 
 REPO = Path(__file__).resolve().parents[1]
@@ -147,37 +147,33 @@ def maps(path: Path) -> None:
 
 
 def risk(path: Path) -> None:
-    """Mean error of the surest answers against the share answered, pooled over scenes, by method."""
+    """Mean error of the surest answers against the fraction answered, pooled over scenes, by method."""
     rows = json.loads((REPO / "benchmarks/results/method_comparison.json").read_text())["rows"]
-    share = np.linspace(0.05, 1.0, 191)  # of fewer a mean says little
-    panel = Panel(
-        "Error of the surest answers, eleven real scenes",
-        Axis(0.0, 0.8, "held-back returns answered, %, mean over scenes", percent=True),
-        Axis(0.0, 0.15, "mean relative error (at most 1), %, mean over scenes", percent=True),
-        size=(560, 330),
-    )
-    keys = []
+    fraction = np.linspace(0.05, 1.0, 191)  # of fewer a mean says little
+    figure, (axes,) = make_figure(size=(560, 330))
     for name in ("paper", "map", "auto", "fused"):
         curves = [
             r["curves"]["risk_coverage"]
             for r in rows
             if r["pair"] is None and r["truth"] == "full" and r["method"] == name and r.get("curves") and not r["role"]
         ]
-        curves = [c for c in curves if c["coverage"]]
-        parts = [_at(c, share) for c in curves]
-        coverage, error = (np.mean([p[k] for p in parts], 0).tolist() for k in (0, 1))
-        stroke = Stroke(colours.METHOD_COLOURS[name], 2.2)
-        panel.line(coverage, error, stroke)
-        panel.dot(coverage[-1], error[-1], stroke, width=7)
+        parts = [_at(curve, fraction) for curve in curves if curve["coverage"]]
+        coverage, error = (np.mean([part[k] for part in parts], 0) for k in (0, 1))
         # the file's `map` is that of release 1, without the test of misaligned depth
-        keys.append(LegendKey("map of release 1" if name == "map" else name, stroke.colour, stroke=stroke))
-    save_figure(panel.figure(keys=keys), path)
+        label = "map of release 1" if name == "map" else name
+        axes.plot(coverage, error, color=colours.METHOD_COLOURS[name], linewidth=2.2, label=label)
+        axes.plot(coverage[-1], error[-1], "o", color=colours.METHOD_COLOURS[name], markersize=7, clip_on=False)
+    set_title(axes, "Error of the surest answers, eleven real scenes", 560)
+    set_axis(axes, "x", "held-back returns answered, %, mean over scenes", percent=True, limits=(0.0, 0.8))
+    set_axis(axes, "y", "mean relative error (at most 1), %, mean over scenes", percent=True, limits=(0.0, 0.15))
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9, labelcolor=colours.INK)
+    save_figure(figure, path)
 
 
-def _at(curve: dict[str, Any], share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coverage and risk of a scene where so large a share of its own answers is kept."""
+def _at(curve: dict[str, Any], fraction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coverage and risk of a scene where so large a fraction of its own answers is kept."""
     coverage, error = (np.array(curve[k], float) for k in ("coverage", "risk"))
-    at = share * coverage[-1]
+    at = fraction * coverage[-1]
     return at, np.interp(at, coverage, error)
 
 

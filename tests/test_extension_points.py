@@ -216,7 +216,7 @@ command("enrich", "data=synthetic", *ROOM, "out=set", "dense=false", "gap=2", "m
 assert "too far for a test" in Path("set/meta/report.html").read_text()
 from dhtorch.cli.gate_messages import suggest_remedy
 assert suggest_remedy("too_far") == "too far for a test; go closer"
-from dhtorch.experiments.report.overlays import overlay_layers
+from dhtorch.experiments.report.figures import overlay_layers
 (layer,) = overlay_layers({"u": [1.0], "v": [2.0], "source": [0], "gate": [Gate.TOO_FAR]})
 assert layer.label == "unanswered: too far"
 import hooks

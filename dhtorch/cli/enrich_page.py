@@ -14,7 +14,7 @@ import numpy as np
 
 from dhtorch.cli.gate_messages import describe_gate
 from dhtorch.codes import SOURCES_OF_KIND, Gate, Source, count_kinds, names, words
-from dhtorch.experiments.report.figure import Figure
+from dhtorch.experiments.report.figures import Figure
 from dhtorch.experiments.report.page import PAGE_CSS, figures_markup, table_markup
 from dhtorch.experiments.report.tables import ReportTable
 from dhtorch.export.lerobot import LogHistogram
@@ -23,10 +23,9 @@ from dhtorch.extract.origin import REPORT_FILES
 from dhtorch.extract.targets import UNKNOWN_CONVENTION
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
-from dhtorch.viz.plots import Axis, LegendKey, Panel
-from dhtorch.viz.plots.colours import FILLED, GATE_COLOURS, RECOVERED, SENSOR, SOFT, UNANSWERED, Stroke
-from dhtorch.viz.plots.document import build_document
-from dhtorch.viz.plots.markup import make_tag
+from dhtorch.viz.plots import add_legend, make_figure, set_axis, set_title
+from dhtorch.viz.plots.colours import FILLED, GATE_COLOURS, RECOVERED, SENSOR, SOFT, UNANSWERED
+from dhtorch.viz.plots.markup import build_document, make_tag
 
 Row = Mapping[str, Any]
 
@@ -194,14 +193,10 @@ def _build_worst_table(owns: Sequence[Row]) -> ReportTable:
 
 def _build_time_figure(owns: Sequence[Row]) -> Figure | None:
     """Fractions of pixels by kind over episode time, averaged over the episodes."""
-    panels = []
-    for name, mean in _average_over_episodes(owns, "over_time"):
-        panel = _make_share_panel(name)
-        for kind, fractions in count_kinds(mean).items():
-            _draw_shares(panel, fractions, _KIND_COLOURS[kind])
-        panels.append(panel)
-    keys = [LegendKey(words(kind), colour, "line") for kind, colour in _KIND_COLOURS.items()]
-    return Figure("Over time", "Mean over the episodes, by camera.", panels, keys) if panels else None
+    kinds = {name: count_kinds(mean) for name, mean in _average_over_episodes(owns, "over_time")}
+    curves = {name: {words(kind): values for kind, values in of.items()} for name, of in kinds.items()}
+    colours = {words(kind): colour for kind, colour in _KIND_COLOURS.items()}
+    return _draw_over_time("Over time", "Mean over the episodes, by camera.", curves, colours)
 
 
 def _build_reason_figure(owns: Sequence[Row]) -> Figure | None:
@@ -209,18 +204,27 @@ def _build_reason_figure(owns: Sequence[Row]) -> Figure | None:
     averages = _average_over_episodes(owns, "no_answer_over_time")
     gates = [gate for gate in _REASON_COLOURS if any(mean[gate].max() > 0 for _, mean in averages)]
     gates = sorted(gates, key=lambda gate: -max(float(mean[gate].mean()) for _, mean in averages))[:_MAX_DRAWN_REASONS]
-    panels = []
-    for name, mean in averages if gates else []:
-        panel = _make_share_panel(name)
-        for gate in gates:
-            _draw_shares(panel, mean[gate], _REASON_COLOURS[gate])
-        panels.append(panel)
-    keys = [LegendKey(describe_gate(NO_ANSWER_REASONS[gate]), _REASON_COLOURS[gate], "line") for gate in gates]
-    return (
-        Figure("Reasons for no answer over time", "Fraction of all pixels, by camera.", panels, keys)
-        if panels
-        else None
-    )
+    reasons = {gate: describe_gate(NO_ANSWER_REASONS[gate]) for gate in gates}
+    curves = {name: {reasons[gate]: mean[gate] for gate in gates} for name, mean in averages if gates}
+    colours = {reasons[gate]: _REASON_COLOURS[gate] for gate in gates}
+    return _draw_over_time("Reasons for no answer over time", "Fraction of all pixels, by camera.", curves, colours)
+
+
+def _draw_over_time(
+    title: str, caption: str, curves: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]
+) -> Figure | None:
+    """Figure of fractions of the pixels over episode time: camera → name → values; None without cameras."""
+    if not curves:
+        return None
+    figure, panels = make_figure(len(curves))
+    for axes, (camera, of_camera) in zip(panels, curves.items(), strict=True):
+        for name, values in of_camera.items():
+            axes.plot(np.linspace(0, 1, len(values)), values, color=colours[name], linewidth=1.8)
+        for axis, label in (("x", "time in the episode, %"), ("y", "pixels, %")):
+            set_axis(axes, axis, label, percent=True, limits=(0.0, 1.0))
+        set_title(axes, camera)
+    add_legend(figure, {name: {"color": colour, "linewidth": 1.8} for name, colour in colours.items()})
+    return Figure(title, caption, figure)
 
 
 def _average_over_episodes(owns: Sequence[Row], column: str) -> list[tuple[str, np.ndarray]]:
@@ -237,11 +241,3 @@ def _average_over_episodes(owns: Sequence[Row], column: str) -> list[tuple[str, 
         ]
         averages.append((name, np.mean(resampled, 0)))
     return averages
-
-
-def _make_share_panel(name: str) -> Panel:
-    return Panel(name, Axis(0, 1, "time in the episode, %", percent=True), Axis(0, 1, "pixels, %", percent=True))
-
-
-def _draw_shares(panel: Panel, shares: Any, colour: str) -> None:
-    panel.line(np.linspace(0, 1, len(shares)).tolist(), shares.tolist(), Stroke(colour, 1.8))

@@ -49,7 +49,7 @@ from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation.capture_check import check_capture
-from dhtorch.viz.plots.canvas import format_capture_name
+from dhtorch.viz.plots import format_capture_name
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
 
 _MAX_LEVELS = 2  # levels of folders searched below the path

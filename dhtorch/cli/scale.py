@@ -22,8 +22,8 @@ from dhtorch.measure.scale import ScaleResult, metric_scale
 from dhtorch.metrics.grouped import mad_sigma
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import open_output_folder
-from dhtorch.viz.plots import Panel, fit_axis, save_figure
-from dhtorch.viz.plots.colours import FAINT, SERIES_COLOURS, Stroke
+from dhtorch.viz.plots import make_figure, save_figure, set_axis
+from dhtorch.viz.plots.colours import FAINT, SERIES_COLOURS
 from dhtorch.viz.viewer import validation as pages
 
 _COLUMNS = ("frame of the capture", "matched by", "scale", "difference", "sigma")
@@ -203,13 +203,12 @@ def _plot(label: str, rows: list[tuple[float, float, float]]) -> bytes:
     rows = [row for row in rows if np.isfinite(row[1])]
     reach = [value for _, y, sigma in rows for value in (y - 2 * sigma, y + 2 * sigma)]
     reach += [-_LEAST_REACH, _LEAST_REACH]
-    x = fit_axis([row[0] for row in rows], label)
-    y = fit_axis(reach, "difference, %", percent=True)
-    panel = Panel("", x, y, size=(420, 216))
-    panel.line([x.low, x.high], [0.0, 0.0], Stroke(FAINT))
-    for at, value, sigma in rows:
-        panel.line([at, at], [value - 2 * sigma, value + 2 * sigma], Stroke(SERIES_COLOURS[0]))
-        panel.dot(at, value, Stroke(SERIES_COLOURS[0]))
+    figure, (axes,) = make_figure(size=(420, 216))
+    axes.axhline(0.0, color=FAINT, linewidth=1.8)
+    at, value, sigma = np.array(rows).reshape(-1, 3).T
+    axes.errorbar(at, value, 2 * sigma, fmt="o", color=SERIES_COLOURS[0], linewidth=1.8, markersize=6.8)
+    set_axis(axes, "x", label)
+    set_axis(axes, "y", "difference, %", percent=True, limits=(1.06 * min(reach), 1.06 * max(reach)))
     buffer = io.BytesIO()
-    save_figure(panel.figure(), buffer)
+    save_figure(figure, buffer)
     return buffer.getvalue()

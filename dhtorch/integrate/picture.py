@@ -16,8 +16,8 @@ from dhtorch.integrate.surface import Surface
 from dhtorch.integrate.volume import VOLUME_SOURCES, splat_points
 from dhtorch.records import Camera, Pose
 from dhtorch.runtime.console import format_count
-from dhtorch.viz.plots import Canvas, LegendKey, Stroke, colours, prefix_title, save_figure
-from dhtorch.viz.plots.colours import INK, colour_by_source
+from dhtorch.viz.plots import add_legend, colours, make_image_grid, mark_options, prefix_title, save_figure
+from dhtorch.viz.plots.colours import INK, SOFT, colour_by_source
 
 #: Allowed lengths of the scale bar, m.
 _SCALE_BAR_LENGTHS_M = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))
@@ -73,33 +73,21 @@ def _side_by_side(
     counts: Mapping[int, int],  # codes.Source → points
     metre: float | None,  # px
 ) -> None:
-    """Draw pictures of one size with the camera path and a scale bar on each, and a legend of the sources."""
-    width, gap = 346.0, 10.0
+    """Draw images of one size with the camera path and a scale bar on each, and a legend of the sources."""
+    figure, (images,) = make_image_grid("", [list(pictures.items())], width=346.0)
     H, W = next(iter(pictures.values())).shape[:2]
-    scale = width / W
-    height = H * scale
-    canvas = Canvas(len(pictures) * (width + gap) - gap, height + 20, dpi=160)
-    for k, (title, pixels) in enumerate(pictures.items()):
-        left = k * (width + gap)
-        canvas.title(title, width, height + 20, left)
-        canvas.picture(pixels, (left, 0, width, height))
-        places = [(left + (u + 0.5) * scale, height - (v + 0.5) * scale) for u, v in camera_path.tolist()]
-        inside = [(u, v) for u, v in places if left <= u <= left + width and 0 <= v <= height]
-        canvas.lines([inside] if inside else [], Stroke(INK, 0.8))
-        canvas.dots(inside, Stroke(INK, 1.5))
-        if metre is not None:
-            _scale_bar(canvas, left, width, metre * scale)
+    inside = camera_path[((camera_path >= -0.5) & (camera_path <= (W - 0.5, H - 0.5))).all(-1)]
+    for axes in images:
+        axes.plot(*inside.T, "o-", color=INK, linewidth=0.8, markersize=1.5)
+        if metre is not None:  # a bar of a round length, at most a fifth of the width, in the lower left corner
+            length = max((x for x in _SCALE_BAR_LENGTHS_M if x * metre <= W / 5), default=_SCALE_BAR_LENGTHS_M[0])
+            left, low = 0.017 * W, H - 0.017 * W
+            axes.plot([left, left + length * metre], [low, low], "|-", color=INK, linewidth=1.2, markersize=5)
+            axes.text(left, low - 0.014 * W, f"{length:g} m", color=SOFT)
     labels = {code: words(name) for code, name in names(Source).items()} | {Source.SWEPT: "recovered (swept)"}
-    keys = [LegendKey(f"{labels[code]}  {n}", colours.SOURCE_COLOURS[code], "box") for code, n in counts.items()]
-    save_figure(canvas.finished(keys), path)
-
-
-def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
-    """Draw a bar of a round length, at most a fifth of the width, in the lower left corner; ``metre`` in points."""
-    length = max((x for x in _SCALE_BAR_LENGTHS_M if x * metre <= width / 5), default=_SCALE_BAR_LENGTHS_M[0])
-    start, end, tick = left + 6, left + 6 + length * metre, 2.5
-    canvas.lines([((start, 6), (end, 6)), *(((x, 6 - tick), (x, 6 + tick)) for x in (start, end))], Stroke(INK, 1.2))
-    canvas.text(f"{length:g} m", start, 11)
+    keys = {f"{labels[code]}  {n}": mark_options(colours.SOURCE_COLOURS[code], "s") for code, n in counts.items()}
+    add_legend(figure, keys, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    save_figure(figure, path)
 
 
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:

@@ -37,7 +37,7 @@ def test_an_episode_has_its_change_point_and_exceeds_its_limit(tmp_path, capture
     stored_outputs.check("pin", root, printed=shown.replace(str(tmp_path), "ROOT"), folder=tmp_path / "out")
     assert "exceeded: moved is" in shown and "from frame 4 by" in shown
     page = (tmp_path / "out" / "pin.html").read_text()
-    assert page.count("data:image/png") == 2 and "<svg" in page and "moved" in page
+    assert page.count("data:image/png") == 2 and page.count("data:image/svg+xml") == 1 and "moved" in page
 
 
 def test_a_picture_within_the_limit_passes_and_the_guide_says_the_way(tmp_path, capture, capsys):

@@ -178,90 +178,47 @@ def test_a_map_without_points_is_white_and_has_no_scale(drawn):
     assert kept.metre is None and all((each == 1).all() for each in kept.pictures.values())
 
 
-# -------------------------------------------------------------------------------------------------------------- canvas
-
-
-class Strokes:
-    """A canvas that keeps what is drawn on it."""
-
-    made: list["Strokes"] = []  # noqa: RUF012  (of one test)
-
-    def __init__(self, width, height, dpi):
-        self.size, self.dpi = (width, height), dpi
-        self.titles, self.pictures, self.segments, self.points, self.texts = [], [], [], [], []
-        Strokes.made.append(self)
-
-    def title(self, text, width, height, left):
-        self.titles.append((text, width, height, left))
-
-    def picture(self, pixels, box):
-        self.pictures.append((pixels, box))
-
-    def lines(self, segments, stroke):
-        self.segments.append(([list(s) for s in segments], stroke.width))
-
-    def dots(self, places, stroke):
-        self.points.append(list(places))
-
-    def text(self, text, u, v):
-        self.texts.append((text, u, v))
-
-    def finished(self, keys):
-        self.keys = keys
-        return self
+# -------------------------------------------------------------------------------------------------------------- figure
 
 
 @pytest.fixture
-def strokes(monkeypatch):
-    Strokes.made = []
-    saved = []
-    monkeypatch.setattr(picture, "Canvas", Strokes)
-    monkeypatch.setattr(picture, "save_figure", lambda figure, path: saved.append((figure, path)))
-    return saved
+def saved(monkeypatch):
+    """The figures that are saved."""
+    figures = []
+    monkeypatch.setattr(picture, "save_figure", lambda figure, path: figures.append(figure))
+    return figures
 
 
-def test_two_pictures_lie_side_by_side_with_path_scale_and_legend(strokes):
+def test_two_pictures_lie_side_by_side_with_path_scale_and_legend(saved):
     pictures = {"one": np.zeros((150, 200, 3)), "two": np.ones((150, 200, 3))}
     path = np.array([[0.0, 0.0], [99.5, 74.5], [500.0, 10.0], [10.0, -5.0]])
     picture._side_by_side("a.png", pictures, path, {Source.SENSOR: 7, Source.SWEPT: 9, Source.FILLED: 3}, 20.0)
-    ((canvas, file),) = strokes
-    scale = 346 / 200
-    height = 150 * scale
-    assert file == "a.png" and canvas.size == (2 * 346 + 10, pytest.approx(height + 20)) and canvas.dpi == 160
-    assert [(t, w, left) for t, w, _, left in canvas.titles] == [("one", 346, 0), ("two", 346, 356)]
-    assert [h for _, _, h, _ in canvas.titles] == [pytest.approx(height + 20)] * 2
-    assert [box for _, box in canvas.pictures] == [
-        (0, 0, 346, pytest.approx(height)),
-        (356, 0, 346, pytest.approx(height)),
-    ]
-    for k, left in enumerate((0, 356)):
-        places = [(left + 0.5 * scale, height - 0.5 * scale), (left + 100 * scale, height - 75 * scale)]
-        np.testing.assert_allclose(canvas.points[k], places)
-        np.testing.assert_allclose(canvas.segments[2 * k][0][0], places)
-        bar, low, high = canvas.segments[2 * k + 1][0]
-        metre = 20 * scale
-        np.testing.assert_allclose(bar, [(left + 6, 6), (left + 6 + 2 * metre, 6)])  # 69.2 points of 1, 2, 5: 2 m
-        np.testing.assert_allclose(low, [(left + 6, 3.5), (left + 6, 8.5)])
-        np.testing.assert_allclose(high, [(left + 6 + 2 * metre, 3.5), (left + 6 + 2 * metre, 8.5)])
-        assert canvas.texts[k] == ("2 m", left + 6, 11)
-    assert [(key.text, key.colour) for key in canvas.keys] == [
-        ("sensor  7", SOURCE_COLOURS[Source.SENSOR]),
-        ("recovered (swept)  9", SOURCE_COLOURS[Source.SWEPT]),
-        ("filled  3", SOURCE_COLOURS[Source.FILLED]),
+    (figure,) = saved
+    lefts = [72 * figure.get_figwidth() * axes.get_position().x0 for axes in figure.axes]
+    assert lefts == pytest.approx([0, 356]) and 72 * figure.get_figwidth() == pytest.approx(702)
+    for axes, (title, pixels) in zip(figure.axes, pictures.items(), strict=True):
+        assert axes.get_title("left") == title and (axes.images[0].get_array() == pixels).all()
+        cameras, bar = axes.lines
+        assert cameras.get_xydata().tolist() == path[:2].tolist(), "those inside"
+        ends = bar.get_xydata()
+        assert ends[1, 0] - ends[0, 0] == 2 * 20.0 and ends[0, 1] == ends[1, 1] and axes.texts[0].get_text() == "2 m"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["sensor 7", "recovered (swept) 9", "filled 3"]
+    assert [h.get_color() for h in legend.legend_handles] == [
+        SOURCE_COLOURS[code] for code in (Source.SENSOR, Source.SWEPT, Source.FILLED)
     ]
 
 
-def test_without_a_scale_or_a_path_neither_is_drawn(strokes):
+def test_without_a_scale_or_a_path_neither_is_drawn(saved):
     picture._side_by_side("a.png", {"one": np.zeros((20, 40, 3))}, np.zeros((0, 2)), {}, None)
-    ((canvas, _),) = strokes
-    assert canvas.size[0] == 346 and canvas.segments == [([], 0.8)] and canvas.points == [[]] and canvas.texts == []
+    (axes,) = saved[0].axes
+    assert not len(axes.lines[0].get_xydata()) and len(axes.lines) == 1 and not axes.texts and not saved[0].legends
 
 
 @pytest.mark.parametrize(
     ("metre", "label"),
     [(69.3, "0.5 m"), (69.2, "1 m"), (34.6, "2 m"), (1e6, "0.001 m"), (0.0173, "2000 m"), (1e-9, "5000 m")],
 )
-def test_the_bar_is_the_longest_round_length_within_a_fifth(strokes, metre, label):
-    canvas = Strokes(346, 100, 160)
-    picture._scale_bar(canvas, 0, 346, metre)
-    assert canvas.texts[0][0] == label
+def test_the_bar_is_the_longest_round_length_within_a_fifth(saved, metre, label):
+    picture._side_by_side("a.png", {"one": np.zeros((100, 346, 3))}, np.zeros((0, 2)), {}, metre)
+    assert saved[0].axes[0].texts[0].get_text() == label

@@ -1,37 +1,40 @@
-"""Figures draw what is stored in ``drawn_figures.json``: every artist with its place, colour, width and letters.
-``DHTORCH_STORE=1 pytest tests/viz/test_drawn_figures.py`` stores them anew, after the pictures have been looked at.
+"""Figures draw what is stored in ``drawn_figures.json``: every artist with its values, colour, width and words.
+
+``DHTORCH_STORE=1 pytest tests/viz/test_drawn_figures.py`` stores them anew, after the images have been looked at.
 """
 
-import io
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from support import drawn
+from matplotlib.figure import Figure
+from support import result_files as archived
+from support.digests import alike
+from support.drawn import describe
 from support.stored_values import stored_values
 
-from dhtorch.cli import inspect as capture
+from dhtorch.cli import enrich_page, scale
 from dhtorch.codes import Gate, Hole, Source, State, names
-from dhtorch.data.survey import Survey, Tile
+from dhtorch.experiments.report import figures, jobs
 from dhtorch.viz import plots
-from dhtorch.viz.plots import Axis, LegendKey, Panel, colours, maps, previews, render_inline_svg
-from dhtorch.viz.plots.panel import save_panels
+from dhtorch.viz.plots import colours, maps
+from dhtorch.viz.viewer import pin
 
 FILE = Path(__file__).with_name("drawn_figures.json")
 HW = (24, 32)
 
 
-def picture(channels=3, hw=HW, seed=0):
-    """A picture of which no two pixels are equal, uint8."""
+def image(channels=3, hw=HW, seed=0):
+    """An image of which no two pixels are equal, uint8."""
     return torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (channels, *hw)).astype(np.uint8))
 
 
-def depth_map(seed=1, hw=HW, low=0.4, high=6.0):
+def depth_map(seed=1):
     """Depth (h, w) m that grows to the lower right, with holes of both kinds."""
-    draw = np.random.default_rng(seed)
-    slope = np.add.outer(np.linspace(0, 0.4, hw[0]), np.linspace(0, 0.6, hw[1]))
-    depth = low * (high / low) ** np.clip(slope + draw.normal(0, 0.01, hw), 0, 1)
+    slope = np.add.outer(np.linspace(0, 0.4, HW[0]), np.linspace(0, 0.6, HW[1]))
+    depth = 0.4 * 15 ** np.clip(slope + np.random.default_rng(seed).normal(0, 0.01, HW), 0, 1)
     depth[:3, :5], depth[-2:, 7] = 0, np.nan
     return depth
 
@@ -41,160 +44,94 @@ def completed_view(label="frame 3", channels=3):
     depth = depth_map()
     source = np.where(depth < 2, Source.SENSOR, Source.RECOVERED)
     source[:4, -6:] = Source.NONE
-    return previews.CompletedView(label, picture(channels), depth, 0.01 * depth**1.5, source)
+    return plots.CompletedView(label, image(channels), depth, 0.01 * depth**1.5, source)
 
 
-def panels():
-    """Panels of every kind of mark, with linear, logarithmic and named axes."""
-    first = Panel("a scene", Axis(0, 1, "share, %", percent=True), Axis(0.01, 1, "error, %", log=True))
-    strokes = plots.assign_strokes(["paper", "map", "mine", "yours"])
-    for k, stroke in enumerate(strokes.values()):
-        first.line([0, 0.25, None, 0.5, None, 0.6, 1], [0.1, 0.15, None, 0.2, None, 0.3, 0.1 * (k + 1)], stroke)
-        first.dot(0.5, 0.2, stroke, 'says <this>: "x" & more')
-    first.diamond(0.7, 0.5, "published: 3")
-    first.bar(0.1, 0.2, 0.01, 0.5, colours.HOLE_COLOURS[Hole.TOO_DARK], colours.SOFT)
-    first.fill([0, 1, 1], [0.1, 0.1, 0.2], colours.FAINT)
-    rows = Panel("", Axis(-2, 30, ""), None, rows=["one", "a name that is much longer than the others are", "three"])
-    rows.bar(0, 12, -0.3, 0.3, colours.SENSOR)
-    rows.dot(20, 2, strokes["mine"], "twenty")
-    wide = Panel("a long title that is set smaller and cut in its middle because it is so long", *first_axes())
-    narrow = Panel("four", Axis(0.2, 0.21, "x"), Axis(1, 3000, "y", log=True), size=(120, 90))
-    narrow.line([0.2, 0.21], [1, 3000], plots.Stroke(colours.INK, 0.5, (4, 3), 0.4))
-    return [first, rows, wide, narrow]
-
-
-def first_axes():
-    return Axis(0, 12, "seconds"), Axis(-3, 3, "metres")
-
-
-def all_keys():
-    """Legend entries of every shape."""
-    shapes = ("line", "dot", "box", "cross", "diamond")
-    dashed = LegendKey("dashed", colours.INK, stroke=plots.Stroke(colours.INK, 2, (4, 3)))
-    return [*(LegendKey(shape, colours.RECOVERED, shape) for shape in shapes), dashed]
-
-
-def samples():
-    """Pixels (N, 2) with a source, a gate and a hole of every code."""
-    draw = np.random.default_rng(4)
-    n = 60
-    codes = [draw.choice(list(names(kind)), n) for kind in (Gate, Hole)]
-    source = draw.choice([Source.NONE, Source.SENSOR, Source.RECOVERED], n)
-    return draw.uniform(0, (HW[1] - 1, HW[0] - 1), (n, 2)), source, *codes
-
-
-def answers():
-    """True depth, depth and score of answers, some missing, some far off."""
-    draw = np.random.default_rng(5)
-    true = draw.uniform(1, 8, 50)
-    depth = true * np.exp(draw.normal(0, 0.1, 50))
-    true[3], depth[5], depth[7], depth[8], depth[9] = np.nan, np.nan, 40, 0.1, 0
-    return true, depth, draw.random(50)
-
-
-def curve(n, seed):
+def curve(n, power):
     coverage = np.linspace(1 / n, 0.8, n)
-    return coverage, 0.02 + 0.1 * coverage ** (1 + seed)
-
-
-def survey(**changes):
-    """What is found in a capture with pictures, maps and confidence of different shapes."""
-    depth = torch.from_numpy(np.nan_to_num(depth_map()))
-    sparse = torch.where(torch.rand(HW, generator=torch.Generator().manual_seed(0)) < 0.05, depth, 0.0)
-    conf = torch.from_numpy(np.random.default_rng(6).integers(0, 3, HW))
-    tiles = [
-        Tile("7", picture(), depth, conf),
-        Tile("a picture with a long name.png", picture(1, (40, 30)), sparse, None),
-        Tile("12", None, depth.T, None),
-    ]
-    path = torch.tensor([[0.0, 0, 0], [0.5, 0.1, 1], [0.4, 0.05, 2]])
-    return Survey("hall/scan 3", "tum", tiles=tiles, depths=depth[depth > 0].flatten(), path=path, **changes)
-
-
-def strip(hw):
-    """The strip's background and one picture."""
-    view = completed_view()
-    made = previews.Strip("Hall", hw, previews.fit_common_depth_axis([view]))
-    return made, made.render(view)
+    return coverage, 0.02 + 0.1 * coverage**power
 
 
 def cases(folder):
     """Name -> what draws."""
-    view, (uv, source, gate, hole), (true, depth, score) = completed_view(), samples(), answers()
-    full, grey = (view.image, view.depth, view.sigma, view.source), picture(1, (48, 64))
+    view, draw = completed_view(), np.random.default_rng(4)
+    uv, gate, hole = draw.uniform(0, (31, 23), (60, 2)), *(draw.choice(list(names(kind)), 60) for kind in (Gate, Hole))
+    source, true = draw.choice([Source.NONE, Source.SENSOR, Source.RECOVERED], 60), draw.uniform(1, 8, 50)
+    depth = true * np.exp(draw.normal(0, 0.1, 50))
+    true[3], depth[5], depth[7], depth[8], depth[9] = np.nan, np.nan, 40, 0.1, 0
     state = np.where(np.nan_to_num(view.depth) < 1, State.WRONG, State.CONSISTENT)
     state[10:14] = State.CANNOT_KNOW
     evidence = np.where(state == State.CANNOT_KNOW, np.nan, np.linspace(-8, 8, HW[1])[None])
-    curves = {"map": curve(30, 0), "paper": curve(40, 1), "few": curve(5, 1)}
-    no = np.zeros(0)
+    curves = {"map": curve(30, 1), "paper": curve(40, 2), "few": curve(5, 2)}
+    no, file = np.zeros(0), folder / "a.png"
+    swept = [archived.pair(), archived.pair()]
+    swept[1] = {**swept[1], "config": {**swept[1]["config"], "seed": 20}}
+    named = [{**r, "config": {**r["config"], "seed": s}} for r, s in zip(swept, ("a $x$ b", "c$"), strict=True)]
+    episodes = [{"cameras": {"front": {"over_time": np.eye(6)[:3].tolist()}}}] * 2
+    reasons = [{"cameras": {"front": {"no_answer_over_time": np.eye(2, 20).tolist()}}}]
     return {
-        "panels": lambda: save_panels(folder / "a.png", panels(), all_keys()),
-        "one panel": lambda: panels()[0].figure(keys=all_keys()[:2], dpi=90),
-        "samples": lambda: plots.draw_samples(folder / "b.png", picture() / 255, uv, source, gate, title="Hall"),
-        "holes": lambda: plots.draw_holes(folder / "c.png", grey, torch.from_numpy(uv), torch.from_numpy(hole)),
-        "depth": lambda: plots.draw_depth(folder / "d.png", true, depth, score, title="Hall"),
-        "depth without a score": lambda: plots.draw_depth(folder / "e.png", torch.from_numpy(true), depth),
-        "no depth": lambda: plots.draw_depth(folder / "f.png", no, no, no),
-        "risk": lambda: plots.draw_risk_coverage(folder / "g.png", curves, oracle=curve(30, 2), title="Hall"),
-        "completed": lambda: plots.draw_completed(folder / "h.png", *full, title="Hall, frame 3"),
-        "completed, open file": lambda: plots.draw_completed(io.BytesIO(), grey, *full[1:], dpi=80, kind="jpeg"),
-        "aligned": lambda: plots.draw_aligned(folder / "i.png", picture(), depth_map(9)[None], view.depth, view.sigma),
-        "contact sheet": lambda: plots.draw_contact_sheet(
-            folder / "j.png", [view, completed_view("frame 9", 1)], title="Hall"
-        ),
-        "validation": lambda: plots.draw_validation(
-            folder / "k.png", view.image, view.depth, state, evidence, title="Hall"
-        ),
+        "samples": lambda: plots.draw_samples(file, image() / 255, uv, source, gate, title="Hall"),
+        "holes": lambda: plots.draw_holes(file, image(1, (48, 64)), torch.from_numpy(uv), torch.from_numpy(hole)),
+        "depth": lambda: plots.draw_depth(file, true, depth, draw.random(50), title="Hall"),
+        "depth without a score": lambda: plots.draw_depth(file, torch.from_numpy(true), depth),
+        "no depth": lambda: plots.draw_depth(file, no, no, no),
+        "risk": lambda: plots.draw_risk_coverage(file, curves, oracle=curve(30, 3), title="Hall"),
+        "no risk": lambda: plots.draw_risk_coverage(file, {}),
+        "completed": lambda: plots.draw_completed(file, *view[1:], title="Hall, frame 3"),
+        "completed, grey": lambda: plots.draw_completed(file, image(1, (48, 64)), *view[2:], dpi=80),
+        "aligned": lambda: plots.draw_aligned(file, image(), depth_map(9)[None], view.depth, view.sigma),
+        "contact sheet": lambda: plots.draw_contact_sheet(file, [view, completed_view("frame 9", 1)], title="Hall"),
+        "validation": lambda: plots.draw_validation(file, view.image, view.depth, state, evidence, title="Hall"),
         "nothing validated": lambda: plots.draw_validation(
-            folder / "l.png", view.image, 0 * view.depth, 0 * state, np.nan * evidence
+            file, view.image, 0 * view.depth, 0 * state, evidence * np.nan
         ),
-        "strip": lambda: strip(HW),
-        "wide strip": lambda: strip((300, 1300)),
-        "inspected": lambda: capture.write_contact_sheet(survey(), folder),
+        "strip": lambda: plots.Strip("Hall", (300, 1300), plots.fit_common_depth_axis([view])),
+        "drift": lambda: pin._draw_drift([("a", [0, 1, 2], [0.5, math.nan, 3.0]), ("b", [0], [1.0])]),
+        "scale": lambda: scale._plot("view", [(0.0, 0.01, 0.02), (1.0, -0.03, 0.001), (2.0, math.nan, 0.0)]),
+        "enriched, over time": lambda: enrich_page._build_time_figure(episodes),
+        "enriched, reasons": lambda: enrich_page._build_reason_figure(reasons),
+        "sweep of a number": lambda: jobs.sweep_figure(swept),
+        "sweep of names": lambda: jobs.sweep_figure(named),
+        **{
+            f"report of {kind}": lambda kind=kind: figures.result_figures(getattr(archived, kind)())
+            for kind in ("range_split", "calibration", "motion", "latency", "hole_census")
+        },
     }
 
 
-def found_figures(monkeypatch, folder):
-    """Name -> lines of its figures."""
-    found = {}
-    for name, call in cases(folder).items():
-        figures = drawn.figures_of(call, monkeypatch)
-        found[name] = [line for figure in figures for line in drawn.describe(figure)]
-    for k, panel in enumerate(panels()):
-        found[f"SVG {k}"] = [render_inline_svg(panel)]
-    for hw in (HW, (300, 1300)):
-        made, pixels = strip(hw)
-        found[f"pixels of the strip {hw}"] = [f"{made.picture_hw} {made.hw}", drawn.summarise(pixels)]
-    found["colours of depths"] = [
-        drawn.summarise(maps.apply_log_cmap(depth_map(), depth_map() > 0, Axis(0.5, 5, "", log=True), kind))
-        for kind in (colours.DEPTH_CMAP, colours.ERROR_CMAP)
-    ]
-    return found
+@pytest.mark.parametrize("name", cases(Path()))
+def test_a_figure_shows_what_is_stored(name, tmp_path, monkeypatch):
+    made, begin = [], Figure.__init__
+    monkeypatch.setattr(
+        Figure, "__init__", lambda self, *args, **options: made.append(self) or begin(self, *args, **options)
+    )
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: None)
+    cases(tmp_path)[name]()
+    lines = [line for figure in made for line in describe(figure)]
+    stored = stored_values(FILE, {name: "\n".join(lines)}, list(cases(tmp_path)))[name].split("\n")
+    wrong = [f"- {b}\n+ {a}" for a, b in zip(lines, stored, strict=False) if not alike(a, b, 1e-3, 2e-3)]
+    assert len(lines) == len(stored) and not wrong, "\n".join(wrong)
 
 
-@pytest.fixture(scope="module")
-def found(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        figures = found_figures(patch, tmp_path_factory.mktemp("drawn"))
-    stored_values(FILE, figures, figures)
-    return figures
-
-
-def test_every_figure_is_stored(found):
-    assert list(found) == list(stored_values(FILE))
-
-
-@pytest.mark.parametrize("name", stored_values(FILE))
-def test_a_figure_shows_what_is_stored(found, name):
-    assert not drawn.differences(found[name], stored_values(FILE)[name])
-
-
-def test_a_changed_figure_is_noticed():
-    lines = ["  Text 1.00 2.00 'a' 10 normal", "image 3x4 0.51"]
-    assert not drawn.differences(["  Text 1.004 2.00 'a' 10 normal", lines[1]], lines)
-    assert drawn.differences(["  Text 1.010 2.00 'a' 10 normal", lines[1]], lines).count("\n") == 1
-    assert drawn.differences(["  Text 1.00 2.00 'b' 10 normal", lines[1]], lines)
-    assert drawn.differences(lines[:1], lines) == "1 lines, stored are 2"
-    one, other = np.zeros((4, 5)), np.zeros((4, 5))
-    other[2, 3] = 1
-    assert drawn.summarise(one) != drawn.summarise(other) != drawn.summarise(other[::-1])
+def test_values_are_painted_by_their_logarithm_and_a_strip_shows_them_in_their_place():
+    scale = maps.Scale("depth, m", colours.DEPTH_CMAP, 1.0, 4.0)
+    shown = scale.paint(np.array([[1.0, 2.0, 4.0, 9.0, 2.0]]), np.array([[True, True, True, True, False]]))
+    linear = maps.Scale("", colours.DEPTH_CMAP, 0.0, 1.0, log=False)
+    assert np.allclose(shown[:, :4], linear.paint(np.array([[0, 0.5, 1, 1]]), np.ones((1, 4), bool)))
+    assert np.allclose(255 * shown[0, 4], colours.parse_rgb(colours.PICTURE))
+    fitted = maps.fit_depth_scale(np.linspace(1.0, 3.0, 1001))
+    assert (fitted.low, fitted.high) == pytest.approx((1.02, 2.98)) and maps.fit_depth_scale(
+        np.full(9, 2.0)
+    ).high == 2.5
+    view = completed_view()
+    strip = plots.Strip("Hall", HW, plots.fit_common_depth_axis([view]))
+    made = strip.render(view)
+    assert made.shape == (*strip.picture_hw, 3) and not made.shape[0] % 2 and not made.shape[1] % 2
+    blank = strip.render(view._replace(image=255 - view.image, depth=0 * view.depth))
+    for (top, left), pixels in zip(strip._corners, view.paint(strip.axis), strict=True):
+        box = made[top : top + HW[0], left : left + HW[1]]
+        assert np.abs(box / 255 - pixels).max() < 0.003
+        blank[top : top + HW[0], left : left + HW[1]] = box
+    assert (blank == made).all(), "nothing else changes"
+    pixels = np.arange(12.0).reshape(3, 4, 1)
+    assert maps._resample(pixels, 3, 2)[..., 0].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]], "at pixel centres"

@@ -2,10 +2,9 @@
 
 Only the result files are read, so ``dhtorch report`` shows a result of any age and machine as its job did.
 
-``reading`` accesses the schema of results, ``cells`` formats numbers, ``tables`` builds tables; ``layouts`` (and
-``timings``) arrange them as the paper does, beside the figures in ``published``; ``plots`` lists the figures (built by
-``curves``, ``sweeps`` and ``overlays`` with the types of ``figure``, drawn by ``dhtorch.viz.plots``); ``text`` and
-``page`` write the output.
+``reading`` accesses the schema of results, ``cells`` formats numbers, ``tables`` builds tables; ``layouts`` lists those
+of the paper, beside the figures in ``published``; ``figures`` draws matplotlib axes, ``jobs`` compares the jobs of a
+sweep; ``text`` and ``page`` write the output.
 """
 
 from __future__ import annotations
@@ -16,17 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dhtorch.experiments.report import job_figure, jobs, page, text
-from dhtorch.experiments.report.advice import advice
+from dhtorch.codes import Gate, describe, words
+from dhtorch.experiments.report import jobs, page, text
 from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
-from dhtorch.experiments.report.reading import Result, describe_result
+from dhtorch.experiments.report.reading import Result, describe_result, metric_value, scene_rows
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, generic_tables
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import HELP_EPILOG, format_count, get_verbosity, progress
 from dhtorch.runtime.output_folder import open_output_folder
-
-#: Largest number of rows that the brief table shows; with more, only the summary.
-_MAX_BRIEF_ROWS = 8
 
 __all__ = [
     "INTERVAL_LABEL",
@@ -60,18 +56,33 @@ def print_tables(result: Result, console: Any = None) -> None:
 
 
 def print_brief(result: Result) -> None:
-    """Print the main table of a result and every other one with figures of the paper; of many scenes the summary."""
+    """Print the main table of a result and every other one with figures of the paper.
+
+    The summary is left out if it repeats a single scene; of more than eight rows it alone is printed.
+    """
     for k, table in enumerate(layout_tables(result) or generic_tables(result, SHOWN_COLUMNS)):
+        n_body, rows, footer = len(table.rows) - table.footer - table.quoted, table.rows, table.footer
+        if footer and n_body == 1:
+            rows, footer = [*rows[:1], *rows[1 + footer :]], 0
+        elif footer and n_body > 8:
+            rows = rows[n_body:]
         if k == 0 or table.cites_paper:
-            text.print_table(_shorten_table(table))
+            text.print_table(replace(table, rows=rows, footer=footer))
 
 
-def _shorten_table(table: ReportTable) -> ReportTable:
-    """The table without its summary if that repeats a single scene, or of many scenes with the summary alone."""
-    n_body = len(table.rows) - table.footer - table.quoted
-    if table.footer and n_body == 1:
-        return replace(table, rows=[*table.rows[:1], *table.rows[n_body + table.footer :]], footer=0)
-    return replace(table, rows=table.rows[n_body:]) if table.footer and n_body > _MAX_BRIEF_ROWS else table
+def advice(result: Result) -> list[str]:
+    """What might help where a job answered next to nothing: a line per scene and reason, from its samples."""
+    lines = []
+    for row in scene_rows(result):
+        fractions = metric_value(row, "gate_share") or {}
+        if "answer" not in fractions or fractions["answer"] > 0.005:
+            continue
+        gate = max((g for g in fractions if g != "answer"), key=lambda g: fractions[g])
+        entry = describe(Gate, gate)
+        if entry is not None and entry.retry:
+            share = f"{words(gate)}: {fractions[gate]:.0%}"
+            lines.append(f"{row['scene']}: no answer, {entry.meaning} ({share}); {entry.retry}")
+    return list(dict.fromkeys(lines))
 
 
 def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:
@@ -90,7 +101,7 @@ def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = Fal
         with open_output_folder(folder, "folder"):
             message = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
             pictured = any(result["config"].get("figures", True) for result in results)
-            if pictured and job_figure.draw_sweep(folder / "sweep.png", results):
+            if pictured and jobs.draw_sweep(folder / "sweep.png", results):
                 message += " and sweep.png"
     except OSError as error:  # a read-only folder, a sweep that is running, a foreign file
         message = f"{folder}: no sweep.csv written ({error.strerror or error})"
@@ -133,21 +144,16 @@ def main(argv: Sequence[str]) -> int:
         return 0  # the table of the sweep is enough; -v shows every job
     for path, result in zip(paths, results, strict=True):
         try:
-            _print_result(path, result, markdown=options.markdown)
+            if options.markdown:
+                print(to_markdown(result))
+                continue
+            print(path)
+            print_tables(result)
         except ValueError as error:  # of a cell
             raise ValueError(f"{path}: {error}") from error
+        if result["verdict"]:
+            print(f"{result['question']}\n{result['verdict']}: {result['why']}\n")
     return 0
-
-
-def _print_result(path: Path, result: Result, *, markdown: bool) -> None:
-    """Print one archived result: its tables, and the verdict on its question."""
-    if markdown:
-        print(to_markdown(result))
-        return
-    print(path)
-    print_tables(result)
-    if result["verdict"]:
-        print(f"{result['question']}\n{result['verdict']}: {result['why']}\n")
 
 
 def _find_results(paths: Iterable[Path]) -> Iterable[Path]:

@@ -45,11 +45,6 @@ _METRIC_HEADINGS = {
     "median_rel_ratio_at_equal_coverage": "error ratio, equal coverage",
     "aurc_ratio": "AURC ratio",
     "aurc_ratio_by_error": "AURC ratio to by_error",
-    "error_ratio_to_window": "error ratio to window",
-    "aurc_full_ratio_to_window": "AURC ratio to window, unanswered as 1",
-    "fixed_gap_ratio": "ratio to the best gap",
-    "pair_ms": "ms per pair",
-    "extra_ms": "ms more",
     "seconds_per_video": "s per video",
     "ece_pooled": "ECE, pooled",
     "range": "median, range over scenes",
@@ -83,31 +78,27 @@ _METRIC_HEADINGS = {
     "interval_2": "inside k = 2",
     "calibrated_2": "inside k = 2, calibrated",
     "scenes_within": "scenes with 95 ± 3 %",
+    "calibrated_scenes_within": "scenes with 95 ± 3 %, calibrated",
     "worst_bias": "largest bias of a range",
     "room_bias": "largest bias, rooms",
     "bias_over_floor": "largest bias over floor",
     "chi2": "χ² of disjoint views",
     "chi2_median": "χ², from the median",
 }
-#: Metric → style, where the rules of :func:`metric_style` do not apply.
-_METRIC_STYLES = {
-    "coverage": "percent",
-    "pnp_success": "percent",
-    "within_sigma": "percent",
-    "within_2sigma": "percent",
-    "truth_kept": "percent",
+#: Style → metrics for which the rules of :func:`metric_style` do not apply.
+_STYLED_METRICS = {
+    "percent": "coverage pnp_success within_sigma within_2sigma truth_kept side_right interval_1 interval_2 "
+    "calibrated_2 scenes_within calibrated_scenes_within floor worst_bias room_bias",
+    "ratio": "rho_abs corr rank_corr abs_corr gated_corr gated_abs_corr order_corr halves_corr bias_over_floor chi2 "
+    "chi2_median",
+    "fine": "mean_rel_ratio ause mse vs_context vs_dinov2 vs_xfeat ece ece_equal_mass ece_pooled monotonicity",
+    "large": "parameters",
+    "bytes": "weight_bytes",
+    "mebibytes": "peak_mib",
 }
-_METRIC_STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
-_METRIC_STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
-_METRIC_STYLES |= dict.fromkeys(("interval_1", "interval_2", "calibrated_2", "scenes_within", "floor"), "percent")
-_METRIC_STYLES |= {"worst_bias": "percent", "room_bias": "percent", "ause": "fine", "bias_over_floor": "ratio"}
-_METRIC_STYLES |= {"chi2": "ratio", "chi2_median": "ratio"}
-_METRIC_STYLES |= dict.fromkeys(("mse", "vs_context", "vs_dinov2", "vs_xfeat"), "fine")
-_METRIC_STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
-_METRIC_STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
-_STYLE_DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
-_LARGE = ((1e9, "B"), (1e6, "M"), (1e3, "k"))
-_BYTES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+_METRIC_STYLES = {metric: style for style, metrics in _STYLED_METRICS.items() for metric in metrics.split()}
+_DECIMALS = {"number": 1, "ratio": 2, "fine": 3}
+_UNITS = {"large": ((1e9, "B"), (1e6, "M"), (1e3, "k")), "bytes": ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))}
 
 
 def metric_heading(metric: str) -> str:
@@ -118,17 +109,16 @@ def metric_heading(metric: str) -> str:
 def metric_style(metric: str) -> str:
     """Style of a metric: percent, ratio, fine, number, count, large, bytes, mebibytes or plain."""
     group, _, last = metric.rpartition(".")
-    if last in _METRIC_STYLES:
-        return _METRIC_STYLES[last]
-    if last.startswith("n_") or group.endswith("n_dropped"):
-        return "count"
-    if last.startswith("coverage_") or last.endswith(("_rel", "_share", "_success")) or group.endswith("_share"):
-        return "percent"
-    if last.startswith(("aurc", "augrc")):
-        return "fine"
-    if group.split(".")[-1] == "ms":
-        return "number"
-    return "ratio" if last.endswith(("_px", "_ratio")) else "plain"
+    rules = (
+        (_METRIC_STYLES.get(last, ""), last in _METRIC_STYLES),
+        ("count", last.startswith("n_") or group.endswith("n_dropped")),
+        ("percent", last.startswith("coverage_") or last.endswith(("_rel", "_share", "_success"))),
+        ("percent", group.endswith("_share")),
+        ("fine", last.startswith(("aurc", "augrc"))),
+        ("number", group.split(".")[-1] == "ms"),
+        ("ratio", last.endswith(("_px", "_ratio"))),
+    )
+    return next((style for style, applies in rules if applies), "plain")
 
 
 def format_value(value: Any, metric: str = "", how: str | None = None) -> str:
@@ -152,9 +142,7 @@ def format_exact(value: Any) -> str:
     """Cell of a value with five significant digits, for the full tables."""
     if isinstance(value, list):
         return ", ".join(map(format_exact, value))
-    if isinstance(value, float):
-        return f"{value:.5g}"
-    return format_value(value, how="plain")
+    return f"{value:.5g}" if isinstance(value, float) else format_value(value, how="plain")
 
 
 def format_metric_interval(low: float | None, high: float | None, metric: str) -> str:
@@ -165,36 +153,18 @@ def format_metric_interval(low: float | None, high: float | None, metric: str) -
 
 
 def _format_number(value: float, how: str) -> str:
-    """Text of a number in a style."""
+    """Text of a number in a style: per cent have two decimals below 10, one above, none at 0 and 100."""
     if how == "percent":
-        return _format_percent(value)
+        decimals = 0 if value in (0, 1) else 2 if abs(100 * value) < 9.995 else 1
+        return f"{100 * value:.{decimals}f} %"
+    if how == "mebibytes":
+        return _format_number(value * 2**20, "bytes")
+    if how in _UNITS:
+        size, unit = next(((size, f" {unit}") for size, unit in _UNITS[how] if abs(value) >= size), (1.0, ""))
+        return f"{_format_number(value / size, 'plain')}{unit}" if unit else f"{value:.0f}"
     if how == "count":
         return f"{value:,.0f}"
-    if how in ("large", "bytes"):
-        return _format_with_unit(value, _LARGE if how == "large" else _BYTES)
-    if how == "mebibytes":
-        return _format_with_unit(value * 2**20, _BYTES)
-    return f"{value:.{_STYLE_DECIMALS[how]}f}" if how in _STYLE_DECIMALS else _format_three_digits(value)
-
-
-def _format_percent(value: float) -> str:
-    """Two decimals below 10 %, one above, none at 0 and 100."""
-    percent = 100 * value
-    decimals = 0 if percent in (0, 100) else 2 if abs(percent) < 9.995 else 1
-    return f"{percent:.{decimals}f} %"
-
-
-def _format_three_digits(value: float) -> str:
-    """Text with three significant digits."""
-    if value == 0:
-        return "0"
-    decimals = max(0, 2 - math.floor(math.log10(abs(value))))
+    if how in _DECIMALS:
+        return f"{value:.{_DECIMALS[how]}f}"
+    decimals = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
     return f"{value:.{decimals}f}" if decimals <= 5 else f"{value:.1e}"
-
-
-def _format_with_unit(value: float, units: tuple[tuple[float, str], ...]) -> str:
-    """Text of a number with the largest unit that fits."""
-    for size, unit in units:
-        if abs(value) >= size:
-            return f"{_format_three_digits(value / size)} {unit}"
-    return f"{value:.0f}"

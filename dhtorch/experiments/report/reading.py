@@ -38,6 +38,16 @@ def scene_rows(result: Result, truth: str | None = None, variant: str | None = N
     return [row for row in rows if variant in (None, row["method"])]
 
 
+def deciding_rows(result: Result) -> list[Row]:
+    """Rows of scenes of the cohort of the verdict."""
+    return scene_rows(result, last_cohort(result))
+
+
+def scene_label(row: Row) -> str:
+    """Name of a scene with its role."""
+    return f"{row['scene']} ({row['role']})" if row.get("role") else str(row["scene"])
+
+
 def metric_value(row: Row, metric: str) -> Any:
     """Value of a metric in a row; a dotted name is a member of a group."""
     if metric in row or "." not in metric:

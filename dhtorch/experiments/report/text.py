@@ -25,17 +25,12 @@ def print_table(table: ReportTable, console: Any = None) -> None:
     for k, head in enumerate(table.flat_head()):
         shown.add_column(escape_markup(head), justify="left" if k < table.n_label else "right", overflow="fold")
     n_body = len(table.rows) - table.footer - table.quoted
+    ends = (n_body, n_body + table.footer)  # of the body and of the summary
     for k, cells in enumerate(table.rows):
-        summed = n_body <= k < n_body + table.footer
-        style = (
-            "bold" if summed and cells[0] != INTERVAL_LABEL else "dim" if summed else "yellow" if k >= n_body else None
-        )
-        last_of_part = k + 1 in (n_body, n_body + table.footer) and k + 1 < len(table.rows)
-        texts = [
-            f"[bold]{escape_markup(c)}[/bold]" if (k, n) in table.best else escape_markup(c)
-            for n, c in enumerate(cells)
-        ]
-        shown.add_row(*texts, style=style, end_section=last_of_part)
+        style = None if k < n_body else "yellow" if k >= ends[1] else "dim" if cells[0] == INTERVAL_LABEL else "bold"
+        texts = map(escape_markup, cells)
+        marked = [f"[bold]{text}[/bold]" if (k, n) in table.best else text for n, text in enumerate(texts)]
+        shown.add_row(*marked, style=style, end_section=k + 1 in ends and k + 1 < len(table.rows))
     console.print(shown)
     if table.note:
         console.print(f"{escape_markup(table.note)}\n", style="dim", highlight=False)
@@ -46,19 +41,16 @@ def tables_to_markdown(tables: Iterable[ReportTable]) -> str:
     parts = []
     for table in tables:
         parts.append(f"**{_escape_cell(table.title)}**\n\n{table_to_markdown(table)}\n")
-        if table.note:
-            parts.append(f"{_escape_cell(table.note)}\n")
+        parts += [f"{_escape_cell(table.note)}\n"] if table.note else []
     return "\n".join(parts)
 
 
 def table_to_markdown(table: ReportTable) -> str:
     """Rows of a table as Markdown, without title and note."""
-    align = [":--" if k < table.n_label else "--:" for k in range(len(table.head))]
-    marked = [
-        [f"**{_escape_cell(c)}**" if (k, n) in table.best else _escape_cell(c) for n, c in enumerate(cells)]
-        for k, cells in enumerate(table.rows)
-    ]
-    rows = ([_escape_cell(c) for c in table.flat_head()], align, *marked)
+    rows = [list(map(_escape_cell, cells)) for cells in (table.flat_head(), *table.rows)]
+    for k, n in table.best:
+        rows[k + 1][n] = f"**{rows[k + 1][n]}**"
+    rows.insert(1, [":--" if k < table.n_label else "--:" for k in range(len(table.head))])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 

@@ -126,6 +126,11 @@ class Stroke(NamedTuple):
     dashes: tuple[float, ...] = ()  # points on, off, …; none = a whole line
     opacity: float = 1.0
 
+    def options(self) -> dict[str, Any]:
+        """Options of ``axes.plot``."""
+        style = (0, self.dashes) if self.dashes else "solid"
+        return {"color": self.colour, "linewidth": self.width, "linestyle": style, "alpha": self.opacity}
+
 
 def assign_strokes(names: Iterable[str]) -> dict[str, Stroke]:
     """Name → stroke: a method's own colour, the others in turn and then dashed."""
@@ -165,11 +170,6 @@ def sample_cmap(name: str, n: int = 17) -> list[str]:
     return [to_hex(colour) for colour in colormaps[name](np.linspace(0, 1, n))]
 
 
-def to_css_colour(colour: str) -> str:
-    """A colour as a page says it: by the name of its variable where it changes in the dark."""
-    return _CSS_VARIABLES.get(colour.lower(), colour.lower())
-
-
 def build_colour_variables() -> str:
     """The variables of a page by day and in the dark, and those of the colours that are the same in both."""
     fixed = {
@@ -188,6 +188,3 @@ def build_colour_variables() -> str:
 def _format_root_rule(variables: dict[str, str]) -> str:
     declarations = " ".join(f"--{name}: {colour};" for name, colour in variables.items())
     return f":root {{ color-scheme: light dark; {declarations} }}"
-
-
-_CSS_VARIABLES = {day.lower(): f"var(--{name})" for name, (day, _) in PAGE_COLOURS.items()}

@@ -1,4 +1,8 @@
-"""HTML elements with escaped text and attributes."""
+"""HTML pages: elements with escaped text and attributes, and the document shared by all pages.
+
+The document has light and dark colours and the style of text, tables and figures. A page appends its own rules and
+loads no external files.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,9 @@ import base64
 import html
 import re
 from collections.abc import Iterable
+from pathlib import Path
+
+from dhtorch.viz.plots.colours import build_colour_variables
 
 _CONTROL = "\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff"
 
@@ -63,3 +70,26 @@ def encode_png_uri(picture: bytes) -> str:
 
 #: Elements without content or closing tag.
 _VOID_ELEMENTS = frozenset(["meta", "link", "br", "hr", "img"])
+
+_STYLE_SHEET = Path(__file__).with_name("page.css")
+
+
+def build_style_sheet(own: Path | None = None) -> Markup:
+    """Style sheet of a page, with its own rules last."""
+    return Markup(
+        "\n".join(
+            [build_colour_variables(), *(p.read_text(encoding="utf-8") for p in (_STYLE_SHEET, own) if p is not None)]
+        )
+    )
+
+
+def build_document(title: str, *body: object, own: Path | None = None) -> str:
+    """Title and body elements -> HTML page; text is escaped unless it is markup."""
+    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    head = make_tag(
+        "head",
+        *(make_tag("meta", **m) for m in metas),
+        make_tag("title", title),
+        make_tag("style", build_style_sheet(own)),
+    )
+    return "<!doctype html>\n" + make_tag("html", head, make_tag("body", *body), lang="en") + "\n"

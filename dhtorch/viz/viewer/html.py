@@ -18,8 +18,7 @@ from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
 from dhtorch.viz.plots.colours import CAUSE_COLOURS, GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
-from dhtorch.viz.plots.document import build_style_sheet
-from dhtorch.viz.plots.markup import Markup, encode_png_uri, escape_html, make_tag
+from dhtorch.viz.plots.markup import Markup, build_style_sheet, encode_png_uri, escape_html, make_tag
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud, SweptPointCloud
 
 HTML_SUFFIXES = (".html", ".htm")

@@ -5,27 +5,20 @@ The page is self-contained. Names from files are untrusted and escaped.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dhtorch.runtime import storage
-from dhtorch.viz.plots.axis import fit_axis
+from dhtorch.viz.plots import draw_line, encode_uri, make_figure, set_axis, set_title
 from dhtorch.viz.plots.colours import SERIES_COLOURS, Stroke
-from dhtorch.viz.plots.document import build_document
-from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
-from dhtorch.viz.plots.panel import Panel
-from dhtorch.viz.plots.svg import render_inline_svg
+from dhtorch.viz.plots.markup import Markup, build_document, encode_png_uri, make_tag
 from dhtorch.viz.viewer.validation import build_scrolled_table
 
 #: Columns of the table, after the episode's name.
 _PIN_COLUMNS = ("verdict", "median shift, px", "its sigma, px", "largest shift, px", "changes")
 
 _PIN_CSS = Path(__file__).with_name("pin.css")
-
-#: Size of the plot of the drift, points.
-_DRIFT_SIZE_PT = (640, 216)
 
 
 @dataclass(frozen=True)
@@ -71,16 +64,13 @@ def _build_blink(episode: PinnedEpisode) -> Markup:
 
 
 def _draw_drift(drift: Sequence[tuple[str, Sequence[int], Sequence[float]]]) -> Markup:
-    """Shift of every picture, px, one episode after the other."""
-    xs: list[float | None] = []
-    ys: list[float | None] = []
+    """Shift of every image, px, one episode after the other."""
+    figure, (axes,) = make_figure(size=(640, 216))
+    first = 0
     for _, _, shifts in drift:
-        first = sum(x is not None for x in xs)
-        xs += [*(float(first + k) for k in range(len(shifts))), None]
-        ys += [*(None if math.isnan(y) else y for y in shifts), None]
-    names = "pictures in order, a line an episode"
-    panel = Panel(
-        "Shift of the scene", fit_axis(xs, names), fit_axis([*ys, 1.0], "shift, px", low=0.0), size=_DRIFT_SIZE_PT
-    )
-    panel.line(xs, ys, Stroke(SERIES_COLOURS[0]))
-    return make_tag("figure", Markup(render_inline_svg(panel)))
+        draw_line(axes, range(first, first + len(shifts)), shifts, Stroke(SERIES_COLOURS[0]))
+        first += len(shifts)
+    set_axis(axes, "x", "images in order, a line an episode")
+    set_axis(axes, "y", "shift, px", limits=(0.0, max(1.06, axes.get_ylim()[1])))
+    set_title(axes, "Shift of the scene")
+    return make_tag("figure", make_tag("img", src=encode_uri(figure), alt="Shift of the scene"))

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.runtime import storage
-from dhtorch.viz.plots.document import build_document
-from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
+from dhtorch.viz.plots.markup import Markup, build_document, encode_png_uri, make_tag
 
 #: Note on the page of a validated data set.
 _STATES_NOTE = "Green is consistent, red is wrong, all else cannot be checked."
