@@ -43,7 +43,6 @@ from dhtorch.geometry.pyramid import (
 from dhtorch.ops.dispatch import operator
 
 #: Largest extrapolation added to a step, as a multiple of that step; more overshoots under large warps.
-#: Source: origin not recorded.
 MAX_EXTRAPOLATION = 0.5
 
 #: Damping of the affine part of the normal equations, (grey value / px)²: the information of 2 / 255 of noise about a
@@ -51,26 +50,18 @@ MAX_EXTRAPOLATION = 0.5
 #: Source: derived, (2 / 255 / 2 px)².
 AFFINE_DAMPING = (2 / 255 / 2) ** 2
 
-#: Limits of the gain of a registration, a ratio of contrasts. Source: origin not recorded.
+#: Limits of the gain of a registration, a ratio of contrasts.
 REGISTRATION_GAIN_RANGE = (0.2, 5.0)
 
-#: Limits of the linear magnification of a registered window, a ratio. Source: origin not recorded.
+#: Limits of the linear magnification of a registered window, a ratio.
 REGISTRATION_SCALE_RANGE = (0.4, 2.5)
-
-#: Magnification from which on image 1 is sampled on its half-size level, where neighbouring pixels of the window are
-#: about a pixel apart again. Source: origin not recorded.
-HALVING_MAGNIFICATION = 1.5
 
 #: Variance of a pyramid's gradient (Scharr's filter) in unit white noise, px⁻².
 #: Source: derived, 2 · (3² + 10² + 3²) / 32².
 GRADIENT_NOISE = 2 * (3**2 + 10**2 + 3**2) / 32**2
 
-#: Largest fraction of the gradient's energy that is attributed to noise. Source: origin not recorded.
+#: Largest fraction of the gradient's energy that is attributed to noise.
 MAX_NOISE_RATIO = 0.9
-
-#: Residual noise variance at the end over that at the start, a ratio, above which a search has diverged.
-#: Source: origin not recorded.
-MAX_RESIDUAL_GROWTH = 1.2
 
 
 class AffineRegistration(NamedTuple):
@@ -249,11 +240,22 @@ def _register(
     state = _search(views, 0, q, point, warp, batch)
     best = state._replace(warp=warp, quality=state.start_quality)
     if len(target.levels) > 1:
-        magnified = _determinant(_linear(state.warp, o.window)) > HALVING_MAGNIFICATION**2
+        # Magnification from which on image 1 is sampled on its half-size level, where neighbouring pixels of the
+        # window are about a pixel apart again.
+        magnified = _determinant(_linear(state.warp, o.window)) > 1.5**2
         state = _State(*masked_apply(magnified, partial(_search, views, 1), state, (q, point, state.warp, batch)))
     shift = ((state.warp * point[:, None]).sum(0) - xy_1).square().sum(0).sqrt()
     shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
-    ok = _accept(state, best.quality, target, o.window) & (shift <= o.max_shift_px)
+    area_scale, gain = _determinant(_linear(state.warp, o.window)), state.quality[0]
+    in_range = (
+        (area_scale > REGISTRATION_SCALE_RANGE[0] ** 2)
+        & (area_scale < REGISTRATION_SCALE_RANGE[1] ** 2)
+        & (gain > REGISTRATION_GAIN_RANGE[0])
+        & (gain < REGISTRATION_GAIN_RANGE[1])
+    )
+    # Residual noise variance at the end over that at the start, a ratio, above which a search has diverged.
+    not_diverged = _noise(state.quality) <= 1.2 * _noise(best.quality)
+    ok = (state.textured & in_range & not_diverged & _inside(state.warp[0], target)) & (shift <= o.max_shift_px)
     best = _State(*(torch.where(ok, new, old) for new, old in zip(state, best, strict=True)))
     rms = best.quality[1].sqrt() / best.quality[0].clamp(*REGISTRATION_GAIN_RANGE)
     A = _linear(best.warp, o.window).transpose(0, 1)
@@ -363,7 +365,19 @@ def _iterate(
     products: Tensor | None,  # (M, 8, w²), to be overwritten
 ) -> _State:
     """Steps of one chunk of points, warps in pixels of the patch; ``inverse`` is the whole one, (8, 8, M)."""
-    inverse, textured = _invert(_normal_matrix(Q))
+    # The normal equations are inverted with a unit diagonal.
+    H = _normal_matrix(Q)
+    diagonal = H.diagonal(dim1=1, dim2=2).double()
+    s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()
+    s = s[:, :, None] * s[:, None]
+    L, info = torch.linalg.cholesky_ex(H * s)
+    textured = (info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_PIVOT)
+    L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * AFFINE_DAMPING**0.5)
+    if L.is_cpu:
+        inverse = torch.cholesky_inverse(L)
+    else:
+        inverse = solve_cholesky(torch.eye(L.shape[-1], dtype=L.dtype, device=L.device).expand_as(L), L)
+    inverse = (inverse * s).to(H.dtype)
     J = _read(patch, warp, o.window)
     quality = start_quality = _quality(Q[:, 6], J, _interpolation_noise_factor(warp[0, ..., None].clone()))
     moving, step, previous = textured, None, None
@@ -395,19 +409,6 @@ def _unregistered(xy_1: Tensor) -> tuple[Tensor, ...]:
     false = torch.zeros_like(xy_1[0], dtype=torch.bool)
     zero = torch.zeros_like(xy_1[0])
     return xy_1, _identity(xy_1), zero, _identity(xy_1), zero, false
-
-
-def _accept(state: _State, start_quality: Tensor, target: Pyramid, window: int) -> Tensor:
-    """Which searches are accepted (M,)."""
-    area_scale, gain = _determinant(_linear(state.warp, window)), state.quality[0]
-    in_range = (
-        (area_scale > REGISTRATION_SCALE_RANGE[0] ** 2)
-        & (area_scale < REGISTRATION_SCALE_RANGE[1] ** 2)
-        & (gain > REGISTRATION_GAIN_RANGE[0])
-        & (gain < REGISTRATION_GAIN_RANGE[1])
-    )
-    not_diverged = _noise(state.quality) <= MAX_RESIDUAL_GROWTH * _noise(start_quality)
-    return state.textured & in_range & not_diverged & _inside(state.warp[0], target)
 
 
 def _covariance(state: _State, point: Tensor, window: int) -> Tensor:
@@ -526,21 +527,6 @@ def _normal_matrix(Q: Tensor) -> Tensor:
     """Normal equations (M, 8, 8) of the eight images."""
     damping = constant(Q, [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]) * AFFINE_DAMPING
     return torch.bmm(Q, Q.transpose(1, 2)) + torch.diag(damping)
-
-
-def _invert(H: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse (M, 8, 8) of the normal equations, and whether it exists (M,)."""
-    diagonal = H.diagonal(dim1=1, dim2=2).double()
-    s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()
-    s = s[:, :, None] * s[:, None]
-    L, info = torch.linalg.cholesky_ex(H * s)
-    textured = (info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_PIVOT)
-    L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * AFFINE_DAMPING**0.5)
-    if L.is_cpu:
-        inverse = torch.cholesky_inverse(L)
-    else:
-        inverse = solve_cholesky(torch.eye(L.shape[-1], dtype=L.dtype, device=L.device).expand_as(L), L)
-    return (inverse * s).to(H.dtype), textured
 
 
 def _warp_change(solution: Tensor) -> Tensor:

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 #: Source: OpenCV calibrateCamera, distortion models without thin prism and tilt.
 COEFFICIENTS = (4, 5, 8)
 
-#: Limits the Newton steps of :func:`undistort`, a count. Source: origin not recorded.
+#: Limits the Newton steps of :func:`undistort`, a count.
 NEWTON_STEPS = 12
 
 #: Limits the distance between a pixel and the distorted image of its ideal pixel, px: converged below, at any focal
-#: length. Source: origin not recorded.
+#: length.
 MAX_RETURN_ERROR_PX = 0.01
 
-#: Limits the magnitude of a lens's Jacobian determinant from below, without unit. Source: origin not recorded.
+#: Limits the magnitude of a lens's Jacobian determinant from below, without unit.
 MIN_DETERMINANT = 1e-12
 
 #: Those of the kernels, in their order: steps, square of a step after which a point stops, px, determinant.
@@ -323,17 +323,13 @@ def _normalised(camera: Camera, uv: Tensor) -> Tensor:
 def _to_pixels(camera: Camera, xy: Tensor) -> Tensor:
     """Pixels of the distorted image at ideal image-plane coordinates."""
     if camera.distortion is not None:
-        xy = _distort_kornia(camera.distortion, xy)
+        # Distorted image-plane coordinates (B, N, 2) of ideal ones, by kornia
+        from kornia.geometry.calibration import distort_points  # noqa: PLC0415
+
+        _check_coefficient_count(camera.distortion)
+        identity = torch.eye(3, dtype=xy.dtype, device=xy.device)
+        xy = distort_points(xy, identity, camera.distortion)
     return xy * camera.f[:, None] + camera.c[:, None]
-
-
-def _distort_kornia(distortion: Tensor, xy: Tensor) -> Tensor:
-    """Distorted image-plane coordinates (B, N, 2) of ideal ones, by kornia."""
-    from kornia.geometry.calibration import distort_points  # noqa: PLC0415
-
-    _check_coefficient_count(distortion)
-    identity = torch.eye(3, dtype=xy.dtype, device=xy.device)
-    return distort_points(xy, identity, distortion)
 
 
 def _planes(xy: Tensor) -> Tensor:

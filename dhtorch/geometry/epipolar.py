@@ -24,12 +24,10 @@ from dhtorch.ops.dispatch import operator
 
 #: Limits the points of all pairs that :func:`triangulate_depth` processes at once, a count: torch does not split so few
 #: over threads.
-#: Source: origin not recorded.
 MAX_CHUNK_TRIANGULATED = 1 << 15
 
 
 #: Least squared slope of a pixel by its depth, px²/m²: below it depth does not move the pixel.
-#: Source: origin not recorded.
 MIN_SQUARED_SLOPE = 1e-18
 
 
@@ -186,7 +184,16 @@ def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, 
     residual = uv_1 - cam.project(cam.ideal(camera_1), Y)
     J_point, J_pose = point_jacobians(camera_1, Y)
     slope = (J_point * direction[..., None, :]).unbind(-1)
-    return TwoView(depth, Y[..., 2], _angle(Y, t), _length(residual), slope[0] + slope[1] + slope[2], J_pose)
+    (y0, y1, y2), (d0, d1, d2) = Y.unbind(-1), (Y - t).unbind(-1)
+    cross = torch.stack((y1 * d2 - y2 * d1, y2 * d0 - y0 * d2, y0 * d1 - y1 * d0), -1)
+    return TwoView(
+        depth,
+        Y[..., 2],
+        pad_elementwise(torch.atan2, _length(cross), y0 * d0 + y1 * d1 + y2 * d2),
+        _length(residual),
+        slope[0] + slope[1] + slope[2],
+        J_pose,
+    )
 
 
 def point_jacobians(
@@ -253,10 +260,3 @@ def _length(v: Tensor) -> Tensor:
     square = (v * v).sum(-1)
     positive = square > 0
     return torch.where(positive, torch.where(positive, square, torch.ones_like(square)).sqrt(), square)
-
-
-def _angle(Y: Tensor, t: Tensor) -> Tensor:
-    """Angle (B, N) at points Y (camera 1) between the rays to camera 1's centre (the origin) and camera 0's (t)."""
-    (y0, y1, y2), (d0, d1, d2) = Y.unbind(-1), (Y - t).unbind(-1)
-    cross = torch.stack((y1 * d2 - y2 * d1, y2 * d0 - y0 * d2, y0 * d1 - y1 * d0), -1)
-    return pad_elementwise(torch.atan2, _length(cross), y0 * d0 + y1 * d1 + y2 * d2)

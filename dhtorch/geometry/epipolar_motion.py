@@ -16,27 +16,8 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import robust_loss
-from dhtorch.geometry.map_estimate import MEDIAN_1D
+from dhtorch.geometry.reprojection_problem import MEDIAN_1D
 from dhtorch.geometry.se3 import Pose
-
-#: Steps of the search for a direction of translation, a count. Source: chosen on built-in rooms of seeds 40 and 41.
-EPIPOLAR_STEPS = 15
-
-#: Bend of the robust kernel at the first of them, px, half as wide at each further one.
-#: Source: chosen on built-in rooms of seeds 40 and 41.
-EPIPOLAR_BEND_PX = 16.0
-
-#: Damping of these steps, a fraction of the trace. Source: origin not recorded.
-EPIPOLAR_DAMPING = 1e-9
-
-#: Least sine between a ray and the translation: nearer ones have no epipolar line. Source: derived, 3 degrees.
-MIN_SINE = 0.05
-
-#: Length of an inlier's distance, in standard deviations. Source: derived, one in 370 Gaussian numbers lies beyond.
-EPIPOLAR_INLIER_SIGMAS = 3.0
-
-#: Largest distance of an inlier, px. Source: derived, three times the last bend of a fit with depth.
-MAX_EPIPOLAR_DISTANCE_PX = 3.0
 
 
 class EpipolarMotion(NamedTuple):
@@ -72,10 +53,15 @@ def fit_epipolar_motion(
     a = torch.linalg.cross(x, b, dim=1)
     s = torch.linalg.eigh((a * weight[:, None]) @ a.mT).eigenvectors[..., 0]  # of the smallest eigenvalue
     distance = torch.zeros_like(weight)
-    for k in range(EPIPOLAR_STEPS):
-        bend = bend_px[:, None].clamp_min(EPIPOLAR_BEND_PX / 2**k)
+    # Steps of the search for a direction of translation, a count. Source: chosen on built-in rooms of seeds 40 and
+    # 41.
+    for k in range(15):
+        # Bend of the robust kernel at the first of them, px, half as wide at each further one. Source: chosen on
+        # built-in rooms of seeds 40 and 41.
+        bend = bend_px[:, None].clamp_min(16.0 / 2**k)
         e = (s[:, None] @ a)[:, 0]
-        sine = torch.linalg.cross(s[..., None].expand_as(x), x, dim=1).norm(dim=1).clamp_min(MIN_SINE)
+        # Least sine between a ray and the translation: nearer ones have no epipolar line. Source: derived, 3 degrees.
+        sine = torch.linalg.cross(s[..., None].expand_as(x), x, dim=1).norm(dim=1).clamp_min(0.05)
         distance = f_px[:, None] * e / sine
         _, robust = robust_loss((distance / bend).square(), "geman_mcclure", 1.0)
         weight = torch.where(used, robust / sine**2, 0.0)
@@ -84,9 +70,12 @@ def fit_epipolar_motion(
         a = torch.linalg.cross(x, b, dim=1)
     ahead = ((b - x * (x * b).sum(1, keepdim=True)) * s[..., None] * weight[:, None]).sum((1, 2))
     s = torch.where(ahead[:, None] < 0, -s, s)  # points lie in front of both cameras
-    inside = used & (distance.abs() < MAX_EPIPOLAR_DISTANCE_PX)
+    # Largest distance of an inlier, px. Source: derived, three times the last bend of a fit with depth.
+    inside = used & (distance.abs() < 3.0)
     noise = masked_median(distance.abs(), inside)[:, 0] / MEDIAN_1D
-    inlier = inside & (distance.abs() < EPIPOLAR_INLIER_SIGMAS * noise[:, None])
+    # Length of an inlier's distance, in standard deviations. Source: derived, one in 370 Gaussian numbers lies
+    # beyond.
+    inlier = inside & (distance.abs() < 3.0 * noise[:, None])
     return EpipolarMotion(Pose(R, (R @ s[..., None])[..., 0]), noise, inlier)
 
 
@@ -96,7 +85,8 @@ def _epipolar_step(x: Tensor, b: Tensor, a: Tensor, s: Tensor, weight: Tensor, *
     dot = (x * b).sum(1, keepdim=True)
     J = torch.cat((x * (s[:, None] @ b) - s[..., None] * dot, tangent @ a), 1)
     H = (J * weight[:, None]) @ J.mT
-    damping = EPIPOLAR_DAMPING * H.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] + 1e-300
+    # Damping of these steps, a fraction of the trace.
+    damping = 1e-9 * H.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] + 1e-300
     H = H + damping * torch.eye(5, dtype=x.dtype, device=x.device)
     step = torch.linalg.solve_ex(H, (J * (weight * (s[:, None] @ a)[:, 0])[:, None]).sum(-1))[0]
     R = R @ se3.exp(F.pad(-step[:, :3], (0, 3))).R

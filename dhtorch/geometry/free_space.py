@@ -13,14 +13,10 @@ from torch import Tensor
 from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.covariance import masked_median
 
-#: Approximate number of samples in a cell of the picture. Source: origin not recorded.
+#: Approximate number of samples in a cell of the picture.
 SAMPLES_PER_CELL = 10
 
-#: Lower limit of the fraction of samples with a return in the cells of returns; in sparser data a missing return is no
-#: evidence of free space. Source: origin not recorded.
-MIN_RETURN_RATIO = 0.6
-
-#: Lower limit of the number of answers that are tested. Source: origin not recorded.
+#: Lower limit of the number of answers that are tested.
 MIN_FREE_SPACE_ANSWERS = 10
 
 
@@ -63,7 +59,9 @@ def free_space_violations(
     has_return = sensed > 0
     pose_returns = pose_returns & has_return
     return_ratio = _return_ratio(uv, has_return)
-    dense = torch.where(has_return, return_ratio, 0).sum(-1) >= MIN_RETURN_RATIO * has_return.sum(-1).clamp_min(1)
+    # Lower limit of the fraction of samples with a return in the cells of returns; in sparser data a missing return
+    # is no evidence of free space.
+    dense = torch.where(has_return, return_ratio, 0).sum(-1) >= 0.6 * has_return.sum(-1).clamp_min(1)
     few_returns = pose_returns.sum(-1) <= candidates.sum(-1)
     candidates = candidates & (return_ratio == 0)
     violating = candidates & (depth.detach() + 2 * sigma.detach() < masked_median(sensed.detach(), pose_returns))

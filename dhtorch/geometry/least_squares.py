@@ -24,19 +24,15 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.ops.dispatch import operator
 
 #: Limits the depth of a point in front of a camera from below, m.
-#: Source: origin not recorded.
 MIN_DEPTH = 1e-6
 
 #: Limits the pivots of a Cholesky factor with unit diagonal from below, without unit: singular where smaller.
-#: Source: origin not recorded.
 MIN_PIVOT = 1e-6
 
 #: Initial damping of :func:`minimise`, a factor on the diagonal without unit.
-#: Source: origin not recorded.
 INITIAL_DAMPING = 1e-4
 
 #: Step of the finite differences in :func:`implicit_step`, rad or m, in float64.
-#: Source: origin not recorded.
 DERIVATIVE_STEP = 1e-7
 
 #: A pose, or another tree of unknowns with a leading batch dimension.

@@ -32,37 +32,35 @@ from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUT
 from dhtorch.ops.dispatch import operator
 
 #: Width of a cell, px of its level: on coarse levels, which only provide the start of the next one, the points of a
-#: cell share one search. Cells are nested, so that they share its start as well. Source: origin not recorded.
+#: cell share one search. Cells are nested, so that they share its start as well.
 CELL_PX = 4
 
-#: Finest level with cells, 0 = full resolution. Source: origin not recorded.
+#: Finest level with cells, 0 = full resolution.
 CELL_LEVEL = 2
 
 #: Number of the step on a map, from 1, that is extrapolated to the limit of the steps (Aitken); finest level only.
-#: Source: origin not recorded.
 AITKEN_STEP = 6
 
-#: Limits of the ratio of successive steps in that extrapolation. Source: origin not recorded.
+#: Limits of the ratio of successive steps in that extrapolation.
 AITKEN_RATIO_RANGE = (-0.9, 0.9)
 
 #: Factor on ``epsilon_px``, the step length at which a point has converged, on coarse levels.
-#: Source: origin not recorded.
 COARSE_EPSILON_FACTOR = 4.0
 
-#: Largest number of Gauss-Newton steps on one map. Source: origin not recorded.
+#: Largest number of Gauss-Newton steps on one map.
 STEPS_PER_MAP = 8
 
 #: Radii of a point's successive maps on the top level, where the displacement is unknown and few cells are searched,
-#: px. A map of radius r covers the offsets from -r to r + 1. Source: origin not recorded.
+#: px. A map of radius r covers the offsets from -r to r + 1.
 TOP_RADII = (2, 2, 2, 2)
 
-#: Radii of the maps on the levels between, px. Source: origin not recorded.
+#: Radii of the maps on the levels between, px.
 MIDDLE_RADII = (1, 2, 2)
 
-#: Radii of the maps on the finest level, px. Source: origin not recorded.
+#: Radii of the maps on the finest level, px.
 FINEST_RADII = (1, 2, 2, 2)
 
-#: Limits of the gain between two windows, a ratio of contrasts. Source: origin not recorded.
+#: Limits of the gain between two windows, a ratio of contrasts.
 CONTRAST_RATIO_RANGE = (0.2, 5.0)
 
 #: What the comparison of two windows leaves free.
@@ -460,19 +458,16 @@ def _on_map(
         if len(field) == 3:
             step = step[:2] / step[2].clamp(*CONTRAST_RATIO_RANGE)
         if k == AITKEN_STEP and k < steps and pair.level == 0:
-            step = _aitken_step(previous, step, o.epsilon_px)
+            ratio = (step * previous).sum(0) / (previous * previous).sum(0).clamp_min(o.epsilon_px**2)
+            step = torch.where(
+                (step * step).sum(0) > o.epsilon_px**2, step / (1 - ratio.clamp(*AITKEN_RATIO_RANGE)), step
+            )
         p = p - step
     p = torch.where(state.active & all_finite(p, 0), p, start)
     within = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
     unconverged = ~within | ((step * step).sum(0) > o.epsilon_px**2)
     active = state.active & unconverged & is_between(p, pair.low - corner, pair.high - corner)
     return _State(p + corner - x, active, within)
-
-
-def _aitken_step(previous: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
-    """Limit of the steps, which shrink geometrically by the ratio of ``step`` to the ``previous`` one (Aitken)."""
-    ratio = (step * previous).sum(0) / (previous * previous).sum(0).clamp_min(epsilon_px**2)
-    return torch.where((step * step).sum(0) > epsilon_px**2, step / (1 - ratio.clamp(*AITKEN_RATIO_RANGE)), step)
 
 
 def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:

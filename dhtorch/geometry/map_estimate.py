@@ -7,14 +7,13 @@ Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import all_known, is_static
-from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.determinism import SUM_LANES, round_up
 from dhtorch.geometry.least_squares import (
     normal_equations,
@@ -25,13 +24,13 @@ from dhtorch.geometry.least_squares import (
 )
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.reprojection_problem import (
-    LinearisedTracks,
+    MIN_NOISE_PX,
     PoseDepthProblem,
     TrackConstants,
     Unknowns,
+    estimate_noise_variance,
     linearise_tracks,
     minimise_tracks,
-    noise_from_medians,
     sandwich_sums,
     shutter_prior,
     squared_residuals,
@@ -41,24 +40,7 @@ from dhtorch.geometry.reprojection_problem import (
 )
 from dhtorch.geometry.se3 import Pose
 
-#: Least estimated standard deviation of a residual coordinate, px.
-#: Source: origin not recorded.
-MIN_NOISE_PX = 0.1
-
-#: Largest estimated standard deviation of a residual coordinate, px.
-#: Source: origin not recorded.
-MAX_NOISE_PX = 5.0
-
-#: Median of |r| / sigma for normal noise in two coordinates, without unit.
-#: Source: derived, sqrt(2 ln 2), the median of a Rayleigh distribution.
-MEDIAN_2D = 1.17741
-
-#: Median of |r| / sigma for normal noise in one coordinate, without unit.
-#: Source: derived, the upper quartile of the standard normal distribution.
-MEDIAN_1D = 0.67449
-
 #: Precision (1/rad²) of the prior that fixes a shutter rate at zero.
-#: Source: origin not recorded.
 GLOBAL_SHUTTER_PRECISION = 1e18
 
 #: Degrees of freedom that a pose takes from its residuals, a count.
@@ -66,22 +48,12 @@ GLOBAL_SHUTTER_PRECISION = 1e18
 N_POSE_PARAMETERS = 6
 
 #: Least ratio of mean psi′ to mean w, without unit: residuals all beyond the bend would make it negative.
-#: Source: origin not recorded.
 MIN_PSI_SLOPE = 0.1
 
-#: Limits a mean weight that is divided by from below, without unit. Source: origin not recorded.
+#: Limits a mean weight that is divided by from below, without unit.
 MIN_WEIGHT_DIVISOR = 1e-9
 
-#: Fractions of the near tracks, nearest first, that alone may show a translation, without unit.
-#: Source: origin not recorded.
-NEAREST_FRACTIONS = (0.25, 0.5)
-
-#: Least number of tracks in such a fraction.
-#: Source: origin not recorded.
-MIN_FRACTION_TRACKS = 20
-
 #: Limits cost differences that count as none, in variances of a residual.
-#: Source: origin not recorded.
 COST_SLACK = 1.0
 
 
@@ -120,11 +92,9 @@ class FitOptions:
     bend: float = 2.0
 
     #: Limits the Levenberg–Marquardt steps of the estimate from near tracks, a count.
-    #: Source: origin not recorded.
     near_steps: int = 4
 
     #: Limits the Levenberg–Marquardt steps of each estimate from all tracks, a count.
-    #: Source: origin not recorded.
     steps: int = 6
 
     #: Blocks of near tracks (across, down) from whose scatter the covariance is enlarged, a count; None = not at all.
@@ -183,7 +153,10 @@ def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> 
     near = near._replace(shutter_rate=zero_rate)
     both = both if o.shutter_sigma > 0 else both._replace(shutter_rate=zero_rate)
     near_noise = noise[:, : near_problem.near.shape[1]]
-    cost_near, cost_both = (_near_cost(near_problem, x, near_noise, o, near_known) for x in (near, both))
+    cost_near, cost_both = (
+        torch.where(near_problem.near, _costs(near_problem, x, near_noise, o, near_known), 0.0).sum(-1)
+        for x in (near, both)
+    )
     accept_far = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
     at, precision = select_batch(accept_far, both, near), torch.where(accept_far, precision, rigid)
     far = torch.where(accept_far, far, no_far)
@@ -234,51 +207,17 @@ def _translates(
     if all_known(translates):
         return translates
     costs = [_costs(problem, x, noise, o, known) for x in (rotation_only, at)]
-    for fraction in NEAREST_FRACTIONS:
-        in_nearest = _nearest_tracks(problem, fraction)
+    # Fractions of the near tracks, nearest first, that alone may show a translation, without unit.
+    for fraction in (0.25, 0.5):
+        inverse = torch.where(problem.near, problem.inverse, 0.0)
+        last = (problem.near.sum(-1, keepdim=True) * fraction).ceil().long().sub(1).clamp_min(0)
+        in_nearest = problem.near & (inverse >= inverse.sort(-1, descending=True).values.gather(-1, last))
         weight = torch.where(in_nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
         without_translation, with_translation = ((track_costs * weight).sum(-1) for track_costs in costs)
         improves = without_translation - with_translation > o.translation_gain * without_translation + COST_SLACK
-        translates = translates | (improves & (in_nearest.sum(-1) >= MIN_FRACTION_TRACKS))
+        # Least number of tracks in such a fraction.
+        translates = translates | (improves & (in_nearest.sum(-1) >= 20))
     return translates
-
-
-def _nearest_tracks(problem: PoseDepthProblem, fraction: float) -> Tensor:
-    """The near tracks (B, N) of the least depth, ``fraction`` of all, and those of equal depth."""
-    inverse = torch.where(problem.near, problem.inverse, 0.0)
-    last = (problem.near.sum(-1, keepdim=True) * fraction).ceil().long().sub(1).clamp_min(0)
-    return problem.near & (inverse >= inverse.sort(-1, descending=True).values.gather(-1, last))
-
-
-@torch.no_grad()
-def estimate_noise_variance(
-    problem: PoseDepthProblem, at: Unknowns, rounds: int = 3, known: TrackConstants | None = None
-) -> Tensor:
-    """Variance (B, N) px² of a residual coordinate from medians; one for the near, one for the far tracks of a pair.
-
-    Medians do not contain the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
-    the previous one. ``known`` is :func:`track_constants` of the problem where already computed.
-    """
-
-    limits = MIN_NOISE_PX**2, MAX_NOISE_PX**2
-
-    def reference() -> Tensor:
-        noise = torch.ones_like(problem.inverse)
-        square_of = squared_residuals_at(problem, at, known)
-        for _ in range(rounds):
-            square, front = square_of(noise)
-            size = square.sqrt()
-            near = masked_median(size, problem.near & front) / MEDIAN_2D
-            far = masked_median(size, problem.far & front) / MEDIAN_1D
-            far = torch.where(problem.far.any(-1, keepdim=True), far, near)
-            factor = torch.where(problem.far, far, near)
-            noise = (noise * factor * factor).clamp(*limits)
-        return noise
-
-    medians = MEDIAN_2D, MEDIAN_1D
-    return noise_from_medians(
-        problem, at, reference=reference, rounds=rounds, medians=medians, limits=limits, known=known
-    )
 
 
 @torch.no_grad()
@@ -297,14 +236,20 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     Source: P. Huber, "Robust Statistics", 1981, section 7.6; of the blocks H. Künsch, "The jackknife and the bootstrap
     for general stationary observations", 1989, with a linear step in place of a new solution.
     """
-    parts = _SandwichParts(problem, solution, o)
+    parts = cache(partial(_sandwich_parts, problem, solution, o))
+
+    def sums() -> tuple[Tensor, Tensor]:
+        _, rows, _, *weights = parts()
+        bread, meat = (normal_equations(rows, weight.double(), block=SUM_LANES)[0] for weight in weights)
+        return bread, meat
+
     A, M = sandwich_sums(
         problem,
         solution.at,
         solution.noise,
         solution.far_weight,
         robust=(o.kernel, o.bend),
-        reference=parts.sums,
+        reference=sums,
         limits=(MIN_PSI_SLOPE, N_POSE_PARAMETERS, MIN_WEIGHT_DIVISOR),
     )
     precision = o.shutter_sigma**-2 if o.shutter_sigma > 0 else GLOBAL_SHUTTER_PRECISION
@@ -314,49 +259,33 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     whole = small_matmul(small_matmul(inverse, M), inverse)
     whole = 0.5 * (whole + whole.transpose(1, 2))
     if o.blocks is not None:
-        used = problem.near & parts.linear.front
-        blocks = _blocks_of(problem.ray, used, *o.blocks)
-        steps = _steps_without_blocks(parts.rows, parts.weights[1], parts.weights[0], blocks, solution)
-        whole = whole * _scatter_ratio(steps, whole, ok, solution)[:, None, None]
+        front, rows, weight, bread, _ = parts()
+        blocks = _blocks_of(problem.ray, problem.near & front, *o.blocks)
+        steps = _steps_without_blocks(rows, bread, weight, blocks, solution)
+        # Covariance of the delete-block jackknife over the stated one, (B,) and at least 1: mean over the
+        # unknowns
+        K = steps.shape[1]
+        whitened, _ = solve_spd(torch.where(ok[:, None, None], whole, torch.eye(9).to(whole)), steps.mT)
+        n_free = N_POSE_PARAMETERS + 3 * (solution.shutter_precision < GLOBAL_SHUTTER_PRECISION)
+        whole = whole * ((K - 1) / K * (steps * whitened.mT).sum((1, 2)) / n_free).clamp_min(1.0)[:, None, None]
     return whole, ok
 
 
-class _SandwichParts:
-    """What the sandwich and the jackknife of :func:`pose_covariance` add up, computed when first read."""
-
-    def __init__(self, problem: PoseDepthProblem, solution: MapSolution, o: FitOptions) -> None:
-        self.problem, self.solution, self.o = problem, solution, o
-
-    @cached_property
-    def linear(self) -> LinearisedTracks:
-        return linearise_tracks(self.problem, self.solution.at)
-
-    @cached_property
-    def rows(self) -> Tensor:
-        """Whitened rows (B, 10, 2, N)."""
-        return whitened_residuals(self.problem, self.linear, self.solution.noise).double()
-
-    @cached_property
-    def weights(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Robust weight w of each track (B, N), and its weights in bread and meat."""
-        problem, solution, o = self.problem, self.solution, self.o
-        square = squared_residuals(problem, self.linear, solution.noise)
-        _, weight = robust_loss(square, o.kernel, o.bend)
-        bread, meat = torch.zeros_like(square), torch.zeros_like(square)
-        near_weight = torch.ones_like(solution.far_weight)
-        for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
-            used = mask & self.linear.front
-            rise, scatter = _rise_and_scatter(square, weight, used, size, o)
-            bread = torch.where(used, weight * (omega * rise)[:, None], bread)
-            meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
-        return weight, bread, meat
-
-    def sums(self) -> tuple[Tensor, Tensor]:
-        """Bread and meat (B, 9, 9)."""
-        _, bread, meat = self.weights
-        A, _ = normal_equations(self.rows, bread.double(), block=SUM_LANES)
-        M, _ = normal_equations(self.rows, meat.double(), block=SUM_LANES)
-        return A, M
+def _sandwich_parts(problem: PoseDepthProblem, solution: MapSolution, o: FitOptions) -> tuple[Tensor, ...]:
+    """What the sandwich and the jackknife of :func:`pose_covariance` add up: whether tracks are in front (B, N),
+    whitened rows (B, 10, 2, N), robust weight of each track (B, N), and its weights in bread and meat."""
+    linear = linearise_tracks(problem, solution.at)
+    rows = whitened_residuals(problem, linear, solution.noise).double()
+    square = squared_residuals(problem, linear, solution.noise)
+    _, weight = robust_loss(square, o.kernel, o.bend)
+    bread, meat = torch.zeros_like(square), torch.zeros_like(square)
+    near_weight = torch.ones_like(solution.far_weight)
+    for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
+        used = mask & linear.front
+        rise, scatter = _rise_and_scatter(square, weight, used, size, o)
+        bread = torch.where(used, weight * (omega * rise)[:, None], bread)
+        meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
+    return linear.front, rows, weight, bread, meat
 
 
 def _blocks_of(ray: Tensor, used: Tensor, across: int, down: int) -> Tensor:
@@ -386,26 +315,10 @@ def _steps_without_blocks(rows: Tensor, bread: Tensor, weight: Tensor, blocks: T
     return steps.unflatten(0, rest.shape[:2])[..., 0]
 
 
-def _scatter_ratio(steps: Tensor, covariance: Tensor, ok: Tensor, solution: MapSolution) -> Tensor:
-    """Covariance of the delete-block jackknife over the stated one, (B,) and at least 1: mean over the unknowns.
-
-    About 1 where errors of near tracks are independent; larger where neighbours share theirs.
-    """
-    K = steps.shape[1]
-    whitened, _ = solve_spd(torch.where(ok[:, None, None], covariance, torch.eye(9).to(covariance)), steps.mT)
-    n_free = N_POSE_PARAMETERS + 3 * (solution.shutter_precision < GLOBAL_SHUTTER_PRECISION)
-    return ((K - 1) / K * (steps * whitened.mT).sum((1, 2)) / n_free).clamp_min(1.0)
-
-
 def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions, known: TrackConstants) -> Tensor:
     """Robust cost (B, N) of every track with weight 1."""
     square, _ = squared_residuals_at(problem, at, known)(noise)
     return robust_loss(square, o.kernel, o.bend)[0]
-
-
-def _near_cost(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions, known: TrackConstants) -> Tensor:
-    """Robust cost (B,) of the near tracks alone."""
-    return torch.where(problem.near, _costs(problem, at, noise, o, known), 0.0).sum(-1)
 
 
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: FitOptions) -> tuple[Tensor, Tensor]:

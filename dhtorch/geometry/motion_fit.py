@@ -23,31 +23,15 @@ from dhtorch.geometry.least_squares import (
     robust_loss,
     solve_spd,
 )
-from dhtorch.geometry.map_estimate import MEDIAN_2D
+from dhtorch.geometry.reprojection_problem import MEDIAN_2D
 from dhtorch.geometry.se3 import Pose
 
 #: Bends of the robust kernel from coarse to fine, px: the first is wider than the scatter of a start from a median
 #: flow, the last narrower than any move of interest. Source: chosen on built-in rooms of seeds 40 and 41.
 FIT_BENDS_PX = (8.0, 4.0, 2.0, 1.0, 1.0)
 
-#: Steps with the kernel fitted to the residuals, a count. Source: chosen on built-in rooms of seeds 40 and 41: later
-#: steps are below 0.001 px.
-FINAL_STEPS = 5
-
-#: Limits of the noise of a track, px: below, exact copies of a picture; above, nothing is followed.
-#: Source: derived, an eighth of the rounding to whole pixels over sqrt(12); the last of ``FIT_BENDS_PX``.
-NOISE_RANGE_PX = (0.036, 1.0)
-
 #: Residual, in standard deviations, at which the kernel bends. Source: chosen on built-in rooms of seeds 40 and 41.
 FINAL_BEND = 3.0
-
-#: Length of an inlier's residual, in standard deviations of a coordinate, at most. Source: derived, one in ninety of
-#: two Gaussian coordinates lies beyond.
-AGREEING_SIGMAS = 3.0
-
-#: Share of the model's covariance that is added to the sandwich, which few groups understate.
-#: Source: chosen on moved cameras in built-in rooms of seeds 40 and 41: .70 of the errors within one sigma.
-MODEL_SHARE = 0.65
 
 
 class Sightings(NamedTuple):
@@ -98,7 +82,9 @@ def fit_motion(
         T, log_zoom, _ = _step(many, T, log_zoom, bend, free)
     best = int(_step(many, T, log_zoom, FIT_BENDS_PX[-1], free)[2].argmin())
     T, log_zoom = T[best : best + 1], log_zoom[best : best + 1]
-    for _ in range(FINAL_STEPS):
+    # Steps with the kernel fitted to the residuals, a count. Source: chosen on built-in rooms of seeds 40 and 41:
+    # later steps are below 0.001 px.
+    for _ in range(5):
         rows, depth = _linearise(seen, T, log_zoom)
         T, log_zoom, _ = _step(
             seen, T, log_zoom, FINAL_BEND * _noise(rows[:, -1], seen.used & (depth > MIN_DEPTH))[:, None], free
@@ -107,9 +93,13 @@ def fit_motion(
     usable = seen.used & (depth > MIN_DEPTH)
     noise = _noise(rows[:, -1], usable)
     square = rows[:, -1].square().sum(1)
-    inlier = usable & (square < (AGREEING_SIGMAS * noise[:, None]) ** 2)
+    # Length of an inlier's residual, in standard deviations of a coordinate, at most. Source: derived, one in ninety
+    # of two Gaussian coordinates lies beyond.
+    inlier = usable & (square < (3.0 * noise[:, None]) ** 2)
     _, weight = robust_loss(square / (FINAL_BEND * noise[:, None]) ** 2, "geman_mcclure", 1.0)
-    rows, sigma = rows[:, [*free, 7]], noise * (MODEL_SHARE * overlap) ** 0.5
+    # Share of the model's covariance that is added to the sandwich, which few groups understate. Source: chosen on
+    # moved cameras in built-in rooms of seeds 40 and 41: .70 of the errors within one sigma.
+    rows, sigma = rows[:, [*free, 7]], noise * (0.65 * overlap) ** 0.5
     cov = rows.new_zeros(len(rows), 7, 7)
     cov[:, torch.tensor(free)[:, None], free] = grouped_covariance(
         rows, torch.where(usable, weight, 0.0), inlier, group, sigma
@@ -142,7 +132,9 @@ def _noise(r: Tensor, usable: Tensor) -> Tensor:
     """Noise (B,) of a coordinate, px, from the median length of the residuals that are no outliers."""
     length = r.square().sum(1).sqrt()
     median = masked_median(length, usable & (length < 3 * FIT_BENDS_PX[-1]))[:, 0]
-    return (median / MEDIAN_2D).clamp(*NOISE_RANGE_PX)
+    # Limits of the noise of a track, px: below, exact copies of a picture; above, nothing is followed. Source:
+    # derived, an eighth of the rounding to whole pixels over sqrt(12); the last of ``FIT_BENDS_PX``.
+    return (median / MEDIAN_2D).clamp(*(0.036, 1.0))
 
 
 def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:

@@ -32,7 +32,7 @@ _NO_DEPTH_METRES: Final = (65.535, 65504.0, 65535.0)  # increasing
 #: Relative rounding of these values in float32. Source: derived, some units of the last place, 1.2e-7.
 _FLOAT32_ROUNDING: Final = 3e-7
 
-#: Least distance of a far constant, m, beyond the surfaces of most rooms. Source: origin not recorded.
+#: Least distance of a far constant, m, beyond the surfaces of most rooms.
 _MIN_FAR_M: Final = 10.0
 
 #: Least share of the map's pixels that have a far constant. Source: chosen on the captures of DHTORCH_DATA, where no
@@ -43,7 +43,7 @@ _MIN_FAR_SHARE: Final = 0.01
 #: depth limits of simulators and data sets: 10, 20, 50, 80, 100, 200, 1000 m.
 _FAR_GRID_M: Final = 10.0
 
-#: Most values between half a far constant and it, per value equal to it. Source: origin not recorded.
+#: Most values between half a far constant and it, per value equal to it.
 _MAX_NEARBY_RATIO: Final = 0.05
 
 #: Evenly spaced values of a map by which its far constant is found. Source: derived, ten times the reciprocal of the

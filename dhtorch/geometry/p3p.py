@@ -17,11 +17,9 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.linalg import cofactor_planes
 
 #: Limits the flatness of a triple: height over longest side below which it is collinear, without unit.
-#: Source: origin not recorded.
 MIN_HEIGHT_RATIO = 1e-3
 
 #: Limits the cosine of the angle between two rays, which is at least about a microradian.
-#: Source: origin not recorded.
 MAX_RAY_COSINE = 1 - 1e-12
 
 
@@ -97,7 +95,15 @@ def p3p_of_planes(
         # Newton's method squares the error: a short step means convergence.
         valid = regular & (step < 1e-3) & (d.amin(0) > 1e-9)
         Y = (d * longest.sqrt())[:, None] * j[:, :, None]  # (point, coordinate, root, *)
-        R, t = _align(torch.cat((Y, X[:, :, None]), 2).to(xyz.dtype))
+        # Rotation (3, 3, 4, *) and translation (3, 4, *) that carry the last triangle onto the first four
+        P = torch.cat((Y, X[:, :, None]), 2).to(xyz.dtype)
+        e = P[1] - P[0]
+        e = e / (e * e).sum(0).sqrt()
+        n = cross(e, P[2] - P[0], dim=0)
+        n = n / (n * n).sum(0).sqrt()
+        axes = torch.stack((e, n, cross(n, e, dim=0)))
+        R = (axes[:, :, None, :4] * axes[:, None, :, 4:]).sum(0)
+        t = P[0, :, :4] - (R * P[0, :, 4:]).sum(1)
         eye = torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim)
         return torch.where(valid, R, eye), t.masked_fill(~valid, 0.0), valid
 
@@ -189,17 +195,3 @@ def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     step = x2 * (r * x1 - r1 * y) + r2 * (y * y1)
     step = step * (det / (det * det + 1e-20))  # none where two solutions coincide
     return d - step, step.abs().amax(0)
-
-
-def _align(P: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation (3, 3, 4, *) and translation (3, 4, *) that carry the last triangle onto the first four.
-
-    ``P`` (point, coordinate, 4 + 1, *). The axes of both triangles are orthonormal, so their product is a rotation.
-    """
-    e = P[1] - P[0]
-    e = e / (e * e).sum(0).sqrt()
-    n = cross(e, P[2] - P[0], dim=0)
-    n = n / (n * n).sum(0).sqrt()
-    axes = torch.stack((e, n, cross(n, e, dim=0)))
-    R = (axes[:, :, None, :4] * axes[:, None, :, 4:]).sum(0)
-    return R, P[0, :, :4] - (R * P[0, :, 4:]).sum(1)

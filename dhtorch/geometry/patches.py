@@ -26,10 +26,6 @@ LUMA_WEIGHTS = tuple(k / 1000 for k in LUMA_THOUSANDTHS)
 #: memory pages. Source: derived, fits the L2/L3 cache.
 MAX_CHUNK_NUMBERS = 1 << 18
 
-#: Number of points over number of pixels of an image from which on windows of the whole image are faster than patches,
-#: a ratio. Source: origin not recorded.
-WHOLE_IMAGE_RATIO = 0.25
-
 #: Variance of rounding grey values in [0, 1] to 8 bits: the lower limit of residual variances.
 #: Source: derived, step² / 12 of a uniform distribution, with step 1 / 255.
 QUANTISATION_VARIANCE = 1 / (12 * 255**2)
@@ -103,7 +99,9 @@ def window_arguments(image: Tensor, pixel: Tensor, size: int) -> tuple[Tensor, T
 
 def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
     """Whether windows of all pixels of an image are faster to compute than the patches around n of them."""
-    return size % 2 == 1 and n >= WHOLE_IMAGE_RATIO * hw[0] * hw[1]
+    # Number of points over number of pixels of an image from which on windows of the whole image are faster than
+    # patches, a ratio.
+    return size % 2 == 1 and n >= 0.25 * hw[0] * hw[1]
 
 
 def gather_reduced(reduced: Tensor, pixel: Tensor, size: int) -> Tensor:

@@ -32,17 +32,17 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
 #: Offsets (down, right) of the signs of a census, px: a checkerboard of 9 x 7 pixels without its middle pixel. 31 signs
-#: fit an int32 whose sign bit marks unseen pixels. Source: origin not recorded.
+#: fit an int32 whose sign bit marks unseen pixels.
 CENSUS_OFFSETS = tuple((i, j) for i in range(-3, 4) for j in range(-4, 5) if (i + j) % 2 and (i, j) != (-3, -4))[:31]
 
-#: Smoothness cost of a step of one plane between neighbouring pixels, in signs. Source: origin not recorded.
+#: Smoothness cost of a step of one plane between neighbouring pixels, in signs.
 STEP_COST = 3
 
-#: Smoothness cost of a jump of any height between neighbouring pixels, in signs. Source: origin not recorded.
+#: Smoothness cost of a jump of any height between neighbouring pixels, in signs.
 JUMP_COST = 18
 
 #: Cost of a pixel that the source view does not show, in signs: less than a misfit (half of the signs), more than a
-#: fit. Source: origin not recorded.
+#: fit.
 UNSEEN_COST = 11
 
 #: Aggregation paths per pixel: from the left, right, top and bottom. Source: derived, 2 axes · 2 directions.
@@ -51,29 +51,25 @@ N_PATHS = 4
 #: Largest number of source views whose costs, at most 31 signs each, add up in one byte. Source: derived, ⌊255 / 31⌋.
 MAX_SWEPT_VIEWS = 8
 
-#: Rows whose best planes are computed at once. Source: origin not recorded.
+#: Rows whose best planes are computed at once.
 ROWS_PER_BLOCK = 32
 
 #: Margin around the reference picture in which the source view is sampled: its longer side over this number.
-#: Source: origin not recorded.
 BORDER_DIVISOR = 4
 
 #: Lower limit of the variance, in a window, of the grey value's derivative by inverse depth, m².
-#: Source: origin not recorded.
 FLAT_GRADIENT_VARIANCE = 1e-12
 
-#: Limits of the gain between two windows, a ratio. Source: origin not recorded.
+#: Limits of the gain between two windows, a ratio.
 WINDOW_GAIN_RANGE = (0.5, 2.0)
 
-#: Lower limit of the variance of grey values (in [0, 1]) in a window. Source: origin not recorded.
+#: Lower limit of the variance of grey values (in [0, 1]) in a window.
 FLAT_VARIANCE = 1e-8
 
 #: Depth in the source view over depth in the reference view up to which a point is behind the source view.
-#: Source: origin not recorded.
 MIN_DEPTH_RATIO = 1e-3
 
 #: Factor on the pixel of a point behind the source view, which moves it outside any picture.
-#: Source: origin not recorded.
 BEHIND_SCALE = 1e9
 
 
@@ -507,7 +503,11 @@ def second_best_margin(some: Tensor, best: BestPlane, reach: Tensor) -> Tensor:
     :func:`aggregate_best_plane`, and repeated for the neighbouring pixels. Gradient: none.
     """
     plane, cost = (x[:, ::2, ::2].contiguous() for x in (best.plane, best.cost))
-    return _upsample_2x(_second_best(some, plane, reach) - cost, best.cost)
+    return (
+        (_second_best(some, plane, reach) - cost)
+        .repeat_interleave(2, 1)
+        .repeat_interleave(2, 2)[:, : best.cost.shape[1], : best.cost.shape[2]]
+    )
 
 
 def _second_best_kernel(costs: Tensor, plane: Tensor, reach: Tensor) -> Tensor:
@@ -530,11 +530,6 @@ def _second_best(costs: Tensor, plane: Tensor, reach: Tensor) -> Tensor:
         near = (plane_index - block_plane[..., None].to(torch.int16)).abs() <= reach
         least.append(block.masked_fill(near, torch.iinfo(costs.dtype).max).amin(-1))
     return torch.cat(least, 1)
-
-
-def _upsample_2x(x: Tensor, like: Tensor) -> Tensor:
-    """Values of every other row and column, repeated to the size of ``like`` (B, h, w)."""
-    return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
 
 
 class WindowFit(NamedTuple):

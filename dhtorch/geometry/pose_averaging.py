@@ -17,12 +17,7 @@ from dhtorch.geometry.least_squares import select_batch, solve_spd
 from dhtorch.geometry.se3 import Pose
 
 #: Limits the measurements tried as start, a count; more are thinned evenly.
-#: Source: origin not recorded.
 MAX_STARTS = 32
-
-#: Limits the steps of reweighted least squares, a count.
-#: Source: origin not recorded.
-REWEIGHTING_STEPS = 12
 
 
 class AveragePose(NamedTuple):
@@ -82,7 +77,8 @@ def average_poses(
         valid = valid & regular.view(B, V)
         information = information.view(B, V, 6, 6)
         mean = _start_pose(flat, information, valid)
-        for _ in range(REWEIGHTING_STEPS):
+        # Limits the steps of reweighted least squares, a count.
+        for _ in range(12):
             xi, square = _deviations(flat, mean, information)
             limit = (bend * _scale(square, valid)[:, None]) ** 2
             weight = torch.where(valid, (1 + square / limit) ** -2, 0.0)
@@ -111,11 +107,6 @@ def average_poses(
     return AveragePose(Pose(answer(mean.R), answer(mean.t)), answer(mean_cov), agree, answer(scale), ok)
 
 
-#: Median of the squared length of six independent standard normal numbers, without unit.
-#: Source: derived, median of the chi² distribution with 6 degrees of freedom.
-_MEDIAN_CHI2_6 = 5.3481
-
-
 def _deviations(flat: Pose, mean: Pose, information: Tensor) -> tuple[Tensor, Tensor]:
     """xi (B, V, 6) from the means to the measurements, and d² (B, V)."""
     B, V = information.shape[:2]
@@ -140,4 +131,6 @@ def _start_pose(flat: Pose, information: Tensor, valid: Tensor) -> Pose:
 
 def _scale(square: Tensor, valid: Tensor) -> Tensor:
     """Factor (B,) on the stated standard deviations that explains the median of d², at least 1."""
-    return (covariance.masked_median(square, valid)[:, 0] / _MEDIAN_CHI2_6).sqrt().clamp_min(1.0)
+    # Median of the squared length of six independent standard normal numbers, without unit. Source: derived, median
+    # of the chi² distribution with 6 degrees of freedom.
+    return (covariance.masked_median(square, valid)[:, 0] / 5.3481).sqrt().clamp_min(1.0)

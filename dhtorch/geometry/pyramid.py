@@ -21,10 +21,10 @@ from dhtorch.geometry.windows import row_bands
 from dhtorch.ops.dispatch import operator
 
 #: Padding of a level beyond half a window, px: the largest distance of a search from a pixel of the image or of the
-#: ``OUTSIDE_MARGIN_PX`` around it. Source: origin not recorded.
+#: ``OUTSIDE_MARGIN_PX`` around it.
 SEARCH_PADDING_PX = 8
 
-#: Largest distance of the centre of a window from the image, px of the level. Source: origin not recorded.
+#: Largest distance of the centre of a window from the image, px of the level.
 OUTSIDE_MARGIN_PX = 4
 
 #: Index of a level's plane of grey values. Source: derived, the order in ``build_pyramid``.
@@ -205,7 +205,12 @@ def _fill_level(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None
     inside = grey[..., pad:-pad, pad:-pad]
     for part in row_bands(below, inside.shape[-2:]):
         inside[..., part, :] = filters.grayscale(below[..., part, :]) if finest else _downscale(below, pad, part)
-    _mirror_padding(grey, pad)
+    # Fill the padding of (B, 1, rows, width) with the image mirrored about its border pixels
+    middle = grey[..., pad:-pad, :]
+    middle[..., :pad] = middle[..., pad + 1 : 2 * pad + 1].flip(-1)
+    middle[..., -pad:] = middle[..., -2 * pad - 1 : -pad - 1].flip(-1)
+    grey[..., :pad, :] = grey[..., pad + 1 : 2 * pad + 1, :].flip(-2)
+    grey[..., -pad:, :] = grey[..., -2 * pad - 1 : -pad - 1, :].flip(-2)
     if level.shape[1] > 1:
         _add_gradients(level, pad, below)
 
@@ -230,15 +235,6 @@ def _downscale(level: Tensor, pad: int, part: slice) -> Tensor:
 
 def _binomial_5(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
     return torch.add(torch.add(a + e, b + d, alpha=4), c, alpha=6) * (1 / 16)
-
-
-def _mirror_padding(grey: Tensor, pad: int) -> None:
-    """Fill the padding of (B, 1, rows, width) with the image mirrored about its border pixels."""
-    middle = grey[..., pad:-pad, :]
-    middle[..., :pad] = middle[..., pad + 1 : 2 * pad + 1].flip(-1)
-    middle[..., -pad:] = middle[..., -2 * pad - 1 : -pad - 1].flip(-1)
-    grey[..., :pad, :] = grey[..., pad + 1 : 2 * pad + 1, :].flip(-2)
-    grey[..., -pad:, :] = grey[..., -2 * pad - 1 : -pad - 1, :].flip(-2)
 
 
 def _add_gradients(level: Tensor, pad: int, below: Tensor) -> None:

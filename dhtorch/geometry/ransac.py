@@ -16,28 +16,19 @@ from dhtorch.geometry.p3p import p3p_of_planes
 from dhtorch.geometry.se3 import Pose
 
 #: Limits the flatness of a point set: spread across over spread along below which it is a line, without unit.
-#: Source: origin not recorded.
 MIN_SPREAD_RATIO = 1e-3
 
 #: Limits the distance of a point, in multiples of the median distance: farther points are directions. With a renderer's
 #: sky at 1e10 m the points of a room would look like a line.
-#: Source: origin not recorded.
 MAX_DISTANCE_RATIO = 100.0
 
-#: Limits the residuals of hypotheses computed together, a count: three planes of them stay in cache.
-#: Source: origin not recorded.
-MAX_CHUNK_RESIDUALS = 1 << 15
-
 #: Limits the points that all hypotheses are scored on first, a count.
-#: Source: origin not recorded.
 PREVIEW_POINTS = 32
 
 #: Limits the hypotheses that are then scored on all points, a count.
-#: Source: origin not recorded.
 SHORTLISTED_POSES = 32
 
 #: Limits the best hypotheses that are returned, a count.
-#: Source: origin not recorded.
 KEPT_POSES = 2
 
 
@@ -104,7 +95,8 @@ def msac_cost(
     """
     sizes = check("msac_cost", poses=(poses, "B 4 P"), points=(points, "B 6 M"), limits=(limits, "B M"))
     uv, xyz = points[:, :2], points[:, 2:]
-    pairs = max(MAX_CHUNK_RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
+    # Limits the residuals of hypotheses computed together, a count: three planes of them stay in cache.
+    pairs = max((1 << 15) // max(sizes["P"] * sizes["M"], 1), 1)
     costs = []
     for b in range(0, len(points), pairs):  # few pairs at a time keep the temporaries in cache
         part = slice(b, b + pairs)

@@ -19,12 +19,14 @@ shutter bundle adjustment", 2012.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import any_possible, check, constant
+from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.determinism import SUM_LANES
 from dhtorch.geometry.least_squares import (
     INITIAL_DAMPING,
@@ -42,12 +44,24 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
 #: Limits how much closer than the nearest near return a far track may be: factor on inverse depth, without unit.
-#: Source: origin not recorded.
 NEAREST_DEPTH_DIVISOR = 2.0
 
 #: Squared residual of a point behind a camera, in variances: far beyond the bend of every robust kernel.
-#: Source: origin not recorded.
 BEHIND_CAMERA_RESIDUAL = 1e4
+
+#: Least estimated standard deviation of a residual coordinate, px.
+MIN_NOISE_PX = 0.1
+
+#: Largest estimated standard deviation of a residual coordinate, px.
+MAX_NOISE_PX = 5.0
+
+#: Median of |r| / sigma for normal noise in two coordinates, without unit.
+#: Source: derived, sqrt(2 ln 2), the median of a Rayleigh distribution.
+MEDIAN_2D = 1.17741
+
+#: Median of |r| / sigma for normal noise in one coordinate, without unit.
+#: Source: derived, the upper quartile of the standard normal distribution.
+MEDIAN_1D = 0.67449
 
 
 @record
@@ -344,44 +358,46 @@ def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Ten
     return _squared_lengths(tracks, (a, b, d)), tracks.front
 
 
-def noise_from_medians(
-    problem: PoseDepthProblem,
-    at: Unknowns,
-    *,
-    reference: Callable[[], Tensor],
-    rounds: int,
-    medians: tuple[float, float],
-    limits: tuple[float, float],
-    known: TrackConstants | None = None,
+@torch.no_grad()
+def estimate_noise_variance(
+    problem: PoseDepthProblem, at: Unknowns, rounds: int = 3, known: TrackConstants | None = None
 ) -> Tensor:
-    """Variance (B, N) px² of a residual coordinate of near and of far tracks, compiled where it can be.
+    """Variance (B, N) px² of a residual coordinate from medians; one for the near, one for the far tracks of a pair.
 
-    Args:
-        problem, at, known: as in :func:`linearise_tracks`.
-        reference: the same in torch.
-        rounds: of estimates, each from residuals that the one before whitened, the first from unit noise.
-        medians: of the size of near and of far residuals under unit noise.
-        limits: of the variance, px².
+    Medians do not contain the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
+    the previous one, the first from unit noise. ``known`` is :func:`track_constants` of the problem where already
+    computed.
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
     c = track_constants(problem) if known is None else known
     tensors = problem.ray, problem.inverse, problem.near, *c, problem.far, at.T.R, at.T.t, at.shutter_rate
-    return _noise(*tensors, reference=reference, numbers=(rounds, *medians, *limits))
+    return _noise(*tensors, tracks=(problem, at, c), rounds=rounds)
 
 
-def _noise_kernel(*tensors: Any, reference: Callable[[], Tensor], numbers: tuple[float, ...]) -> Tensor:
+def _noise_kernel(*tensors: Any, tracks: tuple[PoseDepthProblem, Unknowns, TrackConstants], rounds: int) -> Tensor:
     kernel_args = _kernel_arguments(*tensors)
     noise = torch.empty_like(kernel_args[1])
+    numbers = rounds, MEDIAN_2D, MEDIAN_1D, MIN_NOISE_PX**2, MAX_NOISE_PX**2
     limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
     torch.ops.dhtorch.track_noise.default(*kernel_args, noise, *numbers, *limits)
     return noise
 
 
 @operator(kernel=_noise_kernel, dtypes=_NOISE_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
-def _noise(*tensors: Any, reference: Callable[[], Tensor], numbers: tuple[float, ...]) -> Tensor:
-    """:func:`noise_from_medians` of tracks and unknowns."""
-    return reference()
+def _noise(*tensors: Any, tracks: tuple[PoseDepthProblem, Unknowns, TrackConstants], rounds: int) -> Tensor:
+    """:func:`estimate_noise_variance` of tracks and unknowns."""
+    problem, at, known = tracks
+    noise, square_of = torch.ones_like(problem.inverse), squared_residuals_at(problem, at, known)
+    for _ in range(rounds):
+        square, front = square_of(noise)
+        size = square.sqrt()
+        near = masked_median(size, problem.near & front) / MEDIAN_2D
+        far = masked_median(size, problem.far & front) / MEDIAN_1D
+        far = torch.where(problem.far.any(-1, keepdim=True), far, near)
+        factor = torch.where(problem.far, far, near)
+        noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
+    return noise
 
 
 def _squared_lengths(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -494,34 +510,19 @@ def minimise_tracks(
 
     Gradient: none. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    fixed = _fixed_tensors(problem, noise, far_weight, known)
-
-    def reference() -> tuple[Unknowns, Tensor]:
-        normal, cost = pose_normal_equations_at(
-            problem, noise, far_weight, shutter_precision, kernel=kernel, bend=bend, fixed=fixed
-        )
-
-        def evaluate_rotation(at: Unknowns) -> NormalEquations:
-            value, H, g = normal(at)
-            free = constant(g, ([1.0] * 3 + [0.0] * 3 + [1.0] * 3)[: g.shape[-1]])
-            return NormalEquations(value, H * free * free[:, None] + torch.diag(1 - free), g * free)
-
-        evaluate = evaluate_rotation if rotation_only else normal
-        return minimise(evaluate, at, steps, cost=cost, step=trial_unknowns_step)
-
-    tensors = _track_tensors(problem, *fixed[:2], at)
-    return _minimum(
-        *tensors,
-        fixed[2],
-        shutter_precision,
-        reference=reference,
-        robust=(kernel, bend),
-        options=(steps, rotation_only),
-    )
+    constants, factors, share = fixed = _fixed_tensors(problem, noise, far_weight, known)
+    weights = problem, noise, far_weight, shutter_precision
+    cost_of = partial(pose_normal_equations_at, *weights, kernel=kernel, bend=bend, fixed=fixed)
+    tensors = _track_tensors(problem, constants, factors, at)
+    options = (steps, rotation_only)
+    return _minimum(*tensors, share, shutter_precision, cost_of=cost_of, at=at, robust=(kernel, bend), options=options)
 
 
 #: A robust kernel's name and where it bends, as ``least_squares.robust_loss`` takes them.
 _Robust = tuple[str | None, float]
+
+#: -> normal equations as a function of the unknowns, and the cost alone.
+_CostOf = Callable[[], tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]]
 
 
 def _is_geman_mcclure(*tensors: Any, robust: _Robust, **_: Any) -> bool:
@@ -531,7 +532,7 @@ def _is_geman_mcclure(*tensors: Any, robust: _Robust, **_: Any) -> bool:
 
 
 def _minimum_kernel(
-    *tensors: Any, reference: Callable[[], tuple[Unknowns, Tensor]], robust: _Robust, options: tuple[int, bool]
+    *tensors: Any, cost_of: _CostOf, at: Unknowns, robust: _Robust, options: tuple[int, bool]
 ) -> tuple[Unknowns, Tensor]:
     *tracks, share, precision = tensors
     kernel_args = _kernel_arguments(*tracks)
@@ -562,10 +563,17 @@ def _minimum_kernel(
     when=_is_geman_mcclure,
 )
 def _minimum(
-    *tensors: Any, reference: Callable[[], tuple[Unknowns, Tensor]], robust: _Robust, options: tuple[int, bool]
+    *tensors: Any, cost_of: _CostOf, at: Unknowns, robust: _Robust, options: tuple[int, bool]
 ) -> tuple[Unknowns, Tensor]:
     """:func:`minimise_tracks` of :func:`_track_tensors`, their weight ``share`` (B, N) and the prior's precision."""
-    return reference()
+    (normal, cost), (steps, rotation_only) = cost_of(), options
+
+    def evaluate_rotation(at: Unknowns) -> NormalEquations:
+        value, H, g = normal(at)
+        free = constant(g, ([1.0] * 3 + [0.0] * 3 + [1.0] * 3)[: g.shape[-1]])
+        return NormalEquations(value, H * free * free[:, None] + torch.diag(1 - free), g * free)
+
+    return minimise(evaluate_rotation if rotation_only else normal, at, steps, cost=cost, step=trial_unknowns_step)
 
 
 def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:

@@ -18,9 +18,9 @@ from torch import Tensor
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.filters import grayscale
-from dhtorch.geometry.map_estimate import MEDIAN_2D
 from dhtorch.geometry.patches import is_inside_picture
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
+from dhtorch.geometry.reprojection_problem import MEDIAN_2D
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 if TYPE_CHECKING:

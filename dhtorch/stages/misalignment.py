@@ -21,8 +21,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, ransac
 from dhtorch.geometry.checks import all_finite, any_possible, check, constant
 from dhtorch.geometry.covariance import masked_median
-from dhtorch.geometry.map_estimate import MEDIAN_1D, MIN_NOISE_PX
-from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
+from dhtorch.geometry.reprojection_problem import MEDIAN_1D, MIN_NOISE_PX, undo_rolling_shutter
 from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks

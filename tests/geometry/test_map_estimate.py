@@ -10,16 +10,13 @@ from support import dense_reprojection as dense
 from support.pose_problems import map_pose_inputs
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.map_estimate import (
+from dhtorch.geometry.map_estimate import FitOptions, MapSolution, estimate_map_pose, pose_covariance
+from dhtorch.geometry.reprojection_problem import (
     MAX_NOISE_PX,
     MEDIAN_1D,
     MEDIAN_2D,
     MIN_NOISE_PX,
-    FitOptions,
-    MapSolution,
-    estimate_map_pose,
     estimate_noise_variance,
-    pose_covariance,
 )
 from dhtorch.stages.pose import map_pose
 

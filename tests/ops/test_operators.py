@@ -530,7 +530,7 @@ def equations(turning):
                 reprojection_problem.minimise_tracks(
                     problem, at, noise, *weights, steps=steps, rotation_only=rotation_only, **robust
                 )
-            map_estimate.estimate_noise_variance(problem, at)
+            reprojection_problem.estimate_noise_variance(problem, at)
 
 
 def covariances():
@@ -713,7 +713,9 @@ class Oracle:
 
             agree(name, run(taken(slice(1, 2))), pytree.tree_map_only(torch.Tensor, taken(slice(1, 2)), result), 0, 0)
             assert not any(x.numel() for x in leaves(run(taken(slice(0, 0)))) if x.shape[:1] != (batch,)), name
-        is_alone = name in (*ONE_ROW, *WRITING) or any(map(callable, options.values()))
+        is_alone = name in (*ONE_ROW, *WRITING) or any(
+            callable(x) or isinstance(x, torch.Tensor) for x in pytree.tree_leaves(options)
+        )
         if is_alone or not any(map(is_single, leaves(args))):
             return
         self.left_to_torch = name
