@@ -6,14 +6,11 @@ import math
 import pytest
 import torch
 
-from dhtorch import MAP
 from dhtorch.functional import reprojection_loss, risk_coverage_loss, sigma_weighted_depth_loss
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.metrics import holdout
 from dhtorch.metrics.risk import risk_curve
 from dhtorch.records import Camera, Pose
-from dhtorch.synthetic import SyntheticRoom
 
 D = torch.float64
 NAN, INF = math.nan, math.inf
@@ -178,28 +175,6 @@ def test_reprojection_loss_refuses_wrong_shapes_and_codes():
         reprojection_loss(depth, uv_0, uv_1[:, :-1], *rest)
     with pytest.raises(ValueError, match="expected bool"):
         reprojection_loss(depth, uv_0, uv_1, *rest, keep=torch.zeros(2, 7, dtype=torch.int32))
-
-
-def test_losses_of_an_estimate_as_it_comes():
-    """Recovered depths with their sigma and mask as labels of a network, and reprojected against their tracks: the
-    gradient is finite, to the network's depths and through the method to the focal length."""
-    room = SyntheticRoom(seed=2, hw=(120, 160), path="orbit", n_frames=17, lidar="exact")
-    near, other = (holdout.range_split(room[k], 2.0) for k in (0, 16))
-    log_focal = torch.zeros(1, requires_grad=True)
-    camera = near.camera.replace(f=near.camera.f * log_focal.exp())
-    trace = {}
-    estimate = MAP(near.replace(camera=camera), other.replace(camera=camera), n=256, trace=trace)
-    assert 50 < int(estimate.keep.sum()) < 256
-    network = torch.full_like(estimate.depth, 3.0).requires_grad_()
-    labels = estimate.detach()
-    sigma_weighted_depth_loss(network, labels.depth, labels.sigma, labels.keep).backward()
-    assert network.grad[labels.keep].ne(0).all() and network.grad[~labels.keep].eq(0).all()
-    tracks, pose = trace["tracks"], trace["fit"].T_1_from_0
-    loss = reprojection_loss(
-        estimate.depth, tracks.uv_0, tracks.uv_1, pose, camera, camera, cov=tracks.cov, keep=estimate.keep
-    )
-    loss.backward()
-    assert loss.isfinite() and log_focal.grad.isfinite().all() and log_focal.grad.ne(0).all()
 
 
 # --- risk and coverage ---

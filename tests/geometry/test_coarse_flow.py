@@ -156,25 +156,6 @@ def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
     assert torch.equal(start.apply_similarity(torch.eye(2)[None], places, (H, W)), places)
 
 
-def test_offsets_are_weighted_means_of_their_neighbourhood() -> None:
-    """By plain loops; far from any cell with a weight it is the mean of all cells."""
-    g = torch.manual_seed(2)
-    offset, weight = torch.randn(1, 5, 7, 2, generator=g), torch.rand(1, 5, 7, generator=g)
-    weight[0, :, 3:] = 0
-    found = start._smooth_offsets(offset, weight)[0]
-    mean = (offset * weight[..., None])[0].flatten(0, 1).sum(0) / weight.sum()
-    for i in range(5):
-        for j in range(7):
-            mass, total = 0.0, torch.zeros(2)
-            for di in (-1, 0, 1):
-                for dj in (-1, 0, 1):
-                    if 0 <= i + di < 5 and 0 <= j + dj < 7:
-                        share = float(weight[0, i + di, j + dj]) / (4 * 2 ** (abs(di) + abs(dj)))
-                        mass, total = mass + share, total + share * offset[0, i + di, j + dj]
-            torch.testing.assert_close(found[i, j], (total + 1e-3 * mean) / (mass + 1e-3))
-    torch.testing.assert_close(found[2, 6], mean)
-
-
 MOTIONS = [
     ((80.0, 10.0), 0.0, 1.0),
     ((20.0, -12.0), 30.0, 1.0),

@@ -127,21 +127,6 @@ def test_windows_are_read_between_pixels(size, level):
     )
 
 
-def test_windows_begin_at_whole_pixels_with_the_rest_beside_them():
-    image = noise(2, 1, 34, 45)
-    found = build_pyramid(image, 1, 7)
-    x = torch.tensor([[8.25, 20.0], [11.75, 3.5]], dtype=torch.float64)
-    first, fraction = found.locate(0, x, torch.tensor([1, 0]), 2, (GRAD_Y_PLANE, GREY_PLANE))
-    assert fraction.tolist() == [[0.25, 0.0], [0.75, 0.5]]
-    read = found.read(0, first, 3)
-    assert read.shape == (2, 2, 9)
-    whole = read.view(2, 2, 3, 3)
-    for k, plane in enumerate((GRAD_Y_PLANE, GREY_PLANE)):
-        for n, (b, u, v) in enumerate(((1, 8, 11), (0, 20, 3))):
-            left, top = u + found.pad - 2, v + found.pad - 2
-            assert torch.equal(whole[k, n], found.levels[0][b, plane, top : top + 3, left : left + 3])
-
-
 def test_gradients_to_the_image():
     image = noise(1, 1, 12, 13).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: build_pyramid(x, 1, 3).levels, image, fast_mode=True)

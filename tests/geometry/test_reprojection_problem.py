@@ -68,23 +68,6 @@ def test_far_tracks_are_not_believed_without_a_near_one_to_bound_them():
     assert not reprojection_problem.linearise_tracks(alone, at).front[:, list(FAR)].any()
 
 
-def test_whitened_rows_have_the_gram_matrix_of_the_eliminated_problem():
-    """Six columns of the pose, three of the turn and the residual; far, near, known and unbounded inverse depths."""
-    problem, at = pose_depth_problem()
-    linear = reprojection_problem.linearise_tracks(problem, at)
-    rows, squares = (
-        reprojection_problem.whitened_residuals(problem, linear, NOISE),
-        reprojection_problem.squared_residuals(problem, linear, NOISE),
-    )
-    for b, tracks in enumerate(every(problem, at)):
-        for k, x in enumerate(tracks):
-            if x.front:
-                gram = rows[b, :, :, k] @ rows[b, :, :, k].T
-                np.testing.assert_allclose(gram, x.gram, rtol=1e-6, atol=1e-9 * np.abs(x.gram).max())
-            np.testing.assert_allclose(float(squares[b, k]), x.square, rtol=1e-6)
-    assert squares[0, BEHIND] == squares[0, EPIPOLE] == reprojection_problem.BEHIND_CAMERA_RESIDUAL
-
-
 def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
     problem, at = pose_depth_problem()
     at = at._replace(T=se3.Pose(at.T.R, 0 * at.T.t))

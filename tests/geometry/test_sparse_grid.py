@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.ndimage as ndi
 import torch
 
 from dhtorch.geometry import sparse_grid
@@ -81,40 +82,33 @@ def test_near_cells_are_those_that_touch():
         assert near.tolist() == [touch((0, 0, 0), step)]
 
 
-def by_flooding(ijk):
-    """Labels in order of the first cell, by walking from cell to cell."""
-    label, count = {}, 0
-    for first in ijk:
-        if first not in label:
-            label[first], edge = count, [first]
-            while edge:
-                here = edge.pop()
-                for cell in ijk:
-                    if cell not in label and touch(cell, here):
-                        label[cell] = count
-                        edge.append(cell)
-            count += 1
-    return [label[x] for x in ijk]
+def chain():
+    """A long chain of cells, and one between its first and its last."""
+    turns = np.cumsum(np.eye(3, dtype=int)[np.random.default_rng(3).integers(0, 3, 70)] * [1, 1, -1], axis=0).tolist()
+    return [*turns, np.add(np.min(turns, 0), (0, 0, 5)).tolist()]
 
 
-@pytest.mark.parametrize(("n", "reach"), [(60, 4), (120, 6), (40, 7)])
-def test_components_are_those_of_a_walk_from_cell_to_cell(n, reach):
-    ijk, keys = some_cells(n, reach, seed=n)
-    want = by_flooding(ijk)
-    assert sparse_grid.connected_components(keys).tolist() == want and 3 < max(want) < len(ijk) - 5
+STEPS = list(itertools.product((-1, 0, 1), repeat=3))
 
 
-def test_sparse_grid_hang_together_by_faces_edges_and_corners():
-    steps = list(itertools.product((-1, 0, 1), repeat=3))
-    ijk = sorted({(10 * k + s * i, s * j, s * h) for k, (i, j, h) in enumerate(steps) for s in (0, 1)})
-    labels = sparse_grid.connected_components(torch.tensor([number(x) for x in ijk])).tolist()
-    assert labels == by_flooding(ijk) and max(labels) == 26
-
-
-def test_a_long_chain_is_one_component_and_no_cells_are_none():
-    turns = np.cumsum(np.eye(3, dtype=int)[np.random.default_rng(3).integers(0, 3, 70)] * [1, 1, -1], axis=0)
-    chain = sorted({tuple(x) for x in turns.tolist()})
-    lone = (chain[0][0], chain[0][1], chain[0][2] + 5)  # between the first and the last of the chain
-    ijk = sorted([*chain, lone])
-    assert sparse_grid.connected_components(torch.tensor([number(x) for x in ijk])).tolist() == by_flooding(ijk)
-    assert sparse_grid.connected_components(torch.zeros(0, dtype=torch.int64)).tolist() == []
+@pytest.mark.parametrize(
+    "ijk",
+    [
+        *(some_cells(n, reach, seed=n)[0] for n, reach in ((60, 4), (120, 6), (40, 7))),
+        [
+            (10 * k + s * i, s * j, s * h) for k, (i, j, h) in enumerate(STEPS) for s in (0, 1)
+        ],  # all kinds of neighbours
+        chain(),
+        [],
+    ],
+)
+def test_components_are_those_of_a_labelled_grid(ijk):
+    """Labels count up in the order of the first cells."""
+    ijk = np.array(sorted({tuple(x) for x in ijk}), dtype=int).reshape(-1, 3)
+    dense = np.zeros((300, 160, 160), dtype=int)
+    place = tuple((ijk - ijk.min(0, initial=0)).T)
+    dense[place] = 1
+    label = ndi.label(dense, np.ones((3, 3, 3)))[0][place]
+    _, first, want = np.unique(label, return_index=True, return_inverse=True)
+    found = sparse_grid.connected_components(torch.tensor([number(x) for x in ijk.tolist()], dtype=torch.int64))
+    assert found.tolist() == np.argsort(np.argsort(first))[want].tolist()
