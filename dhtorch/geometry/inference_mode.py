@@ -30,7 +30,10 @@ def run_without_grad(fn: Callable[..., _Result], *args: Any, **options: Any) -> 
     """
     if is_transformed() or torch.is_inference_mode_enabled():  # under a compiler only the first condition is evaluated
         return fn(*args, **options)
-    if forward_ad._current_level >= 0 or _requires_graph(args, options):
+    needs_graph = torch.is_grad_enabled() and any(
+        isinstance(x, Tensor) and x.requires_grad for x in torch_pytree.tree_leaves((args, options))
+    )
+    if forward_ad._current_level >= 0 or needs_graph:
         return fn(*args, **options)
     with torch.inference_mode():
         result = fn(*args, **options)
@@ -40,13 +43,6 @@ def run_without_grad(fn: Callable[..., _Result], *args: Any, **options: Any) -> 
         if isinstance(result, Record)
         else torch_pytree.tree_map(_leave_inference_mode, result)
     )
-
-
-def _requires_graph(*trees: Any) -> bool:
-    """Whether the results of these tensors need a graph."""
-    if not torch.is_grad_enabled():
-        return False
-    return any(isinstance(x, Tensor) and x.requires_grad for x in torch_pytree.tree_leaves(trees))
 
 
 def _leave_inference_mode(x: Any) -> Any:

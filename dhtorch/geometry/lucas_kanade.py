@@ -63,9 +63,6 @@ FINEST_RADII = (1, 2, 2, 2)
 #: Limits of the gain between two windows, a ratio of contrasts.
 CONTRAST_RATIO_RANGE = (0.2, 5.0)
 
-#: What the comparison of two windows leaves free.
-NORMALISATIONS = ("none", "bias", "gain_bias")
-
 
 class SearchOptions(NamedTuple):
     """Options of the search; see :func:`dhtorch.stages.track.lucas_kanade`."""

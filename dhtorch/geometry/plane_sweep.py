@@ -126,14 +126,6 @@ class EpipolarWarp(NamedTuple):
         return row.mul_(hw[1]).add_(column).long()
 
 
-class RectifiedView(NamedTuple):
-    """The source view resampled in the orientation of the reference view, on its pixel grid plus a margin."""
-
-    code: Tensor  # (B, H · W) int32, see the module; negative where view 1 shows nothing and along the border
-    hw: tuple[int, int]  # H and W
-    margin: int  # px from the border to pixel (0, 0) of view 0
-
-
 def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
     """Camera and picture size -> rays (B, N, 3), z = 1, of its pixels and ``margin`` px around; NaN outside the lens.
 
@@ -253,20 +245,17 @@ def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
     return EpipolarWarp(base.ideal_uv, s[:, :2] * f + c * s[:, 2:], s[:, 2])
 
 
-def census_transform(grey: Tensor) -> Tensor:
-    """Pictures (B, 1, h, w) -> codes (B, h, w) int32: of each of 31 neighbours whether it is darker than the middle."""
-    check("census_transform", grey=(grey, "B 1 h w"))
-    return _census(grey)
-
-
 def _census_kernel(grey: Tensor) -> Tensor:
+    check("census_transform", grey=(grey, "B 1 h w"))
     code = torch.empty_like(grey[:, 0], dtype=torch.int32)
     torch.ops.dhtorch.census_transform.default(grey[:, 0], torch.tensor(CENSUS_OFFSETS), code)
     return code
 
 
 @operator(kernel=_census_kernel, dtypes={"grey": torch.float32})
-def _census(grey: Tensor) -> Tensor:
+def census_transform(grey: Tensor) -> Tensor:
+    """Pictures (B, 1, h, w) -> codes (B, h, w) int32: of each of 31 neighbours whether it is darker than the middle."""
+    check("census_transform", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
@@ -278,41 +267,13 @@ def _census(grey: Tensor) -> Tensor:
     return code
 
 
-def count_set_bits(x: Tensor) -> Tensor:
+def _count_set_bits(x: Tensor) -> Tensor:
     """Number of bits that are set among the lower 31 of int32 (…)."""
     x = x - x.bitwise_right_shift(1).bitwise_and_(0x55555555)
     high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
     x = x.bitwise_and_(0x33333333).add_(high)
     x = x.add_(x.bitwise_right_shift(4)).bitwise_and_(0x0F0F0F0F)
     return x.mul_(0x01010101).bitwise_right_shift_(24)  # the highest byte holds the sum of all bytes
-
-
-def rectify_view(base: ReferenceView, view: SweptView, wanted: Tensor) -> RectifiedView:
-    """Source view -> its codes in the orientation of the reference view; unseen in pairs that are not ``wanted`` (B,).
-
-    Gradient: none."""
-    margin = max(base.hw) // BORDER_DIVISOR
-    hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
-    ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
-    uv, in_front = project_inverse_depth(view, ray, ray.new_zeros(ray.shape[:2]))
-    grey, inside = sample_bilinear(view.image, uv)
-    visible = (inside & in_front).unflatten(-1, hw) & wanted[:, None, None]
-    visible = F.pad(visible[:, 1:-1, 1:-1], (1, 1, 1, 1))
-    code = census_transform(grey.detach().unflatten(-1, hw)[:, 0, None])
-    return RectifiedView(torch.where(visible, code, -1).flatten(1), hw, margin)
-
-
-def census_cost(base: ReferenceView, seen: RectifiedView, go: EpipolarWarp, q: Tensor) -> Tensor:
-    """Matching cost (B, N) int32 of the reference pixels at inverse depths q (B, N) or (B, 1): signs that differ;
-    :data:`UNSEEN_COST` where view 1 does not show them. Gradient: none."""
-    return _census_cost(base.code.flatten(1), seen, go, q)
-
-
-def _census_cost(code_0: Tensor, rectified: RectifiedView, warp: EpipolarWarp, q: Tensor) -> Tensor:
-    code = rectified.code.gather(1, warp.cell(q, rectified.hw, rectified.margin))
-    count = count_set_bits(code ^ code_0)
-    unseen_mask = code.bitwise_right_shift(31)  # all bits or none; boolean masks take three times as long
-    return count.add_(unseen_mask.bitwise_and_(UNSEEN_COST - count))
 
 
 @torch.no_grad()
@@ -330,17 +291,17 @@ def add_census_costs(
     At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C comes from :func:`new_cost_volume`, or has its planes first
     in memory. Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
-    rectified = rectify_view(base, view, wanted)
-    layout = rectified.hw, rectified.margin
-    _add_costs(
-        C.movedim(1, -1),
-        base.code.flatten(1),
-        rectified.code,
-        *epipolar_warp(base, view),
-        q,
-        layout=layout,
-        fresh=fresh,
-    )
+    margin = max(base.hw) // BORDER_DIVISOR
+    hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
+    # The source view in the orientation of the reference view, on its pixel grid plus the margin.
+    ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
+    uv, in_front = project_inverse_depth(view, ray, ray.new_zeros(ray.shape[:2]))
+    grey, inside = sample_bilinear(view.image, uv)
+    visible = (inside & in_front).unflatten(-1, hw) & wanted[:, None, None]
+    visible = F.pad(visible[:, 1:-1, 1:-1], (1, 1, 1, 1))
+    code = torch.where(visible, census_transform(grey.detach().unflatten(-1, hw)[:, 0, None]), -1).flatten(1)
+    warp = epipolar_warp(base, view)
+    _add_costs(C.movedim(1, -1), base.code.flatten(1), code, *warp, q, layout=(hw, margin), fresh=fresh)
 
 
 def _add_costs_kernel(*tensors: Any, layout: tuple[tuple[int, int], int], fresh: bool) -> None:
@@ -358,15 +319,18 @@ def _add_costs_kernel(*tensors: Any, layout: tuple[tuple[int, int], int], fresh:
     any_layout=("b", "c", "q"),
 )
 def _add_costs(*tensors: Any, layout: tuple[tuple[int, int], int], fresh: bool) -> None:
-    """:func:`add_census_costs` to C (B, h, w, D), from codes (B, N) and (B, H · W), the fields of
-    :class:`EpipolarWarp` and ``layout``, the size and margin of the rectified view."""
+    """:func:`add_census_costs` to C (B, h, w, D), from codes (B, N) and (B, H · W), negative where view 1 shows
+    nothing, the fields of :class:`EpipolarWarp` and ``layout``, the size and margin of the rectified view."""
     C, code_0, code_1, a, b, c, q = tensors
-    rectified = RectifiedView(code_1, *layout)
     warp = EpipolarWarp(a, b, c)
     if fresh:
         C.zero_()
     for k in range(q.shape[1]):
-        C[..., k] += _census_cost(code_0, rectified, warp, q[:, k, None]).to(torch.uint8).unflatten(-1, C.shape[1:3])
+        code = code_1.gather(1, warp.cell(q[:, k, None], *layout))
+        count = _count_set_bits(code ^ code_0)
+        unseen = code.bitwise_right_shift(31)  # all bits or none; boolean masks take three times as long
+        cost = count.add_(unseen.bitwise_and_(UNSEEN_COST - count))
+        C[..., k] += cost.to(torch.uint8).unflatten(-1, C.shape[1:3])
 
 
 def _new_cost_volume_kernel(q: Tensor, *, hw: tuple[int, int]) -> Tensor:

@@ -737,7 +737,7 @@ SAMPLES = "_classify_holes _read_samples _sensor_values _window_texture containi
 WINDOWS = "_classify_holes _read_samples _window_texture containing_pixels"
 FRONT = "_depth_variance _fill_level _near_pose _parallax _search _squared_differences _triangulate"
 METHODS = (
-    f"{WINDOWS} {FRONT} _equations _mean_cost _minimum _noise _rays _register_level _sandwich _solve _squares _census"
+    f"{WINDOWS} {FRONT} _equations _mean_cost _minimum _noise _rays _register_level _sandwich _solve _squares census_transform"
     " _project sample_bilinear new_cost_volume _add_costs aggregate_best_plane _second_best smooth_within_tolerance"
     " _fit_windows _pose_variance _add_to_sums _occlusion_mask _gate _filter _filled _merge"
 )
@@ -757,15 +757,15 @@ CALLS = {
     "depths": (depths_in_metres, "_check_returns _write_metres"),
     "tokens": (tokens, "_pool_tokens"),
     "surfaces": (surfaces, "_second_best aggregate_best_plane"),
-    "costs": (costs, "_add_costs _census _project new_cost_volume"),
-    "projections": (partial(every, projections, (False, 0), (True, 0), (True, 5), (False, 8)), "_census _project smooth_within_tolerance"),
+    "costs": (costs, "_add_costs census_transform _project new_cost_volume"),
+    "projections": (partial(every, projections, (False, 0), (True, 0), (True, 5), (False, 8)), "census_transform _project smooth_within_tolerance"),
     "components": (connected, "_small"),
     "filters": (partial(every, filtered, ((60, 77),), ((23, 90),), ((2, 9),), ((1, 1),)), "_filter"),
     "gates": (gates, "_gate _merge"),
     **{f"planes, {name}": (partial(every, filled, ((150, 203),), ((97, 240),), **options), "_filled") for name, options in PLANE_OPTIONS.items()},
     "planes, small": (partial(every, filled, ((5, 150),), ((3, 2),), ((0, 4),)), "_filled"),
-    "fits": (partial(every, fits, ((41, 53),), ((6, 70), BENT), ((9, 3),)), "_census _fit_windows _project _rays"),
-    "occlusions": (partial(every, occlusions, (False,), (True,)), "_census _occlusion_mask _pose_variance"),
+    "fits": (partial(every, fits, ((41, 53),), ((6, 70), BENT), ((9, 3),)), "census_transform _fit_windows _project _rays"),
+    "occlusions": (partial(every, occlusions, (False,), (True,)), "census_transform _occlusion_mask _pose_variance"),
     "search": (partial(searched, "none", 21, 4), "_fill_level _search _squared_differences"),
     "search, bias": (partial(searched, "bias", 15, 3), "_fill_level _search _squared_differences"),
     "search, gain": (partial(searched, "gain_bias", 21, 2), "_fill_level _search _squared_differences"),
@@ -789,7 +789,7 @@ CALLS = {
     "parallaxes": (partial(every, parallaxes, (False,), (True,)), "_near_pose _parallax"),
     "depth profiles": (depth_profiles, "_mean_cost"),
     "map poses": (map_poses, "_equations _minimum _near_pose _noise _rays _sandwich _solve _squares"),
-    "left to torch": (left_to_torch, "_census _fill_level _project _solve _window_brightness _window_extremes containing_pixels sample_bilinear"),
+    "left to torch": (left_to_torch, "census_transform _fill_level _project _solve _window_brightness _window_extremes containing_pixels sample_bilinear"),
 }  # fmt: skip
 
 #: Call -> other tolerances: with a free gain single precision itself does not determine one point in twenty.
