@@ -8,7 +8,7 @@ import pkgutil
 import pytest
 import torch
 from support.contract_inputs import HW, cameras, generator, pixels, poses, shifted, tracked, uniform
-from support.contract_rows import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
+from support.contract_rows import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 
 from dhtorch.alignment import (
     align,
@@ -66,7 +66,6 @@ from dhtorch.pipeline import (
     surface,
     view_selection,
 )
-from dhtorch.pipeline.presets import MAP, PAPER
 from dhtorch.records import Frame, TrackHint
 from dhtorch.stages import (
     backproject,
@@ -80,7 +79,6 @@ from dhtorch.stages import (
     track_chain,
     triangulate,
 )
-from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation import evidence, faults, validate, wrong_causes
 
 FEW = 11  # points; no other axis of any answer is as long
@@ -818,25 +816,6 @@ def named(promise):
 def test_floating_outputs_follow_the_inputs_dtype(row, dtype):
     out = leaves(row.fn(*row.make(2, 7, dtype)))
     assert out and all(x.dtype == dtype for x in out if x.is_floating_point())
-
-
-@pytest.mark.parametrize("row", [pytest.param(r, id=f"{r.fn.__module__.split('.')[-1]}.{r.fn.__name__}") for r in ROWS])
-def test_masks_are_no_numbers(row):
-    args = row.make(2, 7, torch.float32)
-    with NoMasksAsNumbers():
-        row.fn(*args)
-
-
-def test_no_method_counts_with_masks():
-    """All stages of a method with one and several source views, and the synthetic room."""
-    room = SyntheticRoom(n_frames=3, hw=(96, 128), depth_hw=(24, 32))
-    frames = [room[i] for i in range(3)]
-    with NoMasksAsNumbers():
-        SyntheticRoom(n_frames=2, seed=1, hw=(96, 128), depth_hw=(24, 32))[0]
-        for method in (PAPER, MAP, MAP.replace(views=2)):
-            method.replace(n=64)(frames[0], frames[1:] if method.views > 1 else frames[1])
-    with pytest.raises(AssertionError, match="mul of a mask"), NoMasksAsNumbers():
-        (frames[0].depth > 0) * frames[0].depth
 
 
 @named("batch")

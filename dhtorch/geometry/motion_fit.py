@@ -134,7 +134,7 @@ def _noise(r: Tensor, usable: Tensor) -> Tensor:
     median = masked_median(length, usable & (length < 3 * FIT_BENDS_PX[-1]))[:, 0]
     # Limits of the noise of a track, px: below, exact copies of a picture; above, nothing is followed. Source:
     # derived, an eighth of the rounding to whole pixels over sqrt(12); the last of ``FIT_BENDS_PX``.
-    return (median / MEDIAN_2D).clamp(*(0.036, 1.0))
+    return (median / MEDIAN_2D).clamp(0.036, 1.0)
 
 
 def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:

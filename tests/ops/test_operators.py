@@ -14,6 +14,7 @@ from functools import partial
 
 import pytest
 import torch
+from support.contract_inputs import tracked
 from support.contract_rows import equal, leaves
 from support.pose_problems import NOISE, map_pose_inputs, pose_depth_problem
 from support.public_entries import VIEWS, differing_entries, public_results
@@ -45,7 +46,7 @@ from dhtorch.ops import loader
 from dhtorch.pipeline import dense, map_filters, planes, surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
 from dhtorch.pipeline.pair import merge, undistort_tracks
-from dhtorch.records import DepthMap, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.records import DepthMap, Frame, MergedDepth, PoseFit, Shutter, TrackHint
 from dhtorch.stages import misalignment, pose
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
@@ -470,18 +471,14 @@ def magnified():
 
 
 def near_pairs(batch, n, wrong):
-    """Points 0.5 to 2.5 m away seen again with 0.3 px of noise, a fraction of them anywhere: input of ``pnp_ransac``."""
-    of_both = Camera(uniform(batch, 2, low=500, high=550), uniform(batch, 2, seed=1, low=300, high=320))
-    uv_0, depth = uniform(batch, n, 2, seed=2, high=640), uniform(batch, n, seed=3, low=0.5, high=2.5)
-    xyz = camera.unproject(of_both, uv_0, depth)
-    T = se3.exp(0.1 * torch.randn(batch, 6, generator=drawn(4)))
-    uv_1 = camera.project(of_both, se3.apply(T, xyz)) + 0.3 * torch.randn(batch, n, 2, generator=drawn(5))
-    uv_1 = torch.where(uniform(batch, n, 1, seed=6) < wrong, uniform(batch, n, 2, seed=7, high=640), uv_1)
-    zero, code = torch.zeros(batch, n), torch.zeros(batch, n, dtype=torch.int32)
-    found = Samples(uv_0, depth, 0.01 * depth, xyz, zero, code, zero, code)
-    valid = uniform(batch, n, seed=8) < 0.9
-    tracks = Tracks(uv_0, uv_1, zero, zero, torch.eye(2).expand(batch, n, 2, 2), valid)
-    return found, tracks, of_both, of_both, uniform(batch, 64, 3, seed=9)
+    """Points 1 to 4 m away seen again with noise, a fraction of them anywhere: input of ``pnp_ransac``."""
+    found, tracks, _, *cameras = tracked(batch, n, torch.float32)
+    outlier = uniform(batch, n, 1, seed=6) < wrong
+    tracks = tracks.replace(
+        uv_1=torch.where(outlier, uniform(batch, n, 2, seed=7, high=64), tracks.uv_1),
+        valid=uniform(batch, n, seed=8) < 0.9,
+    )
+    return found, tracks, *cameras, uniform(batch, 64, 3, seed=9)
 
 
 def near_poses(batch, n, wrong, **options):

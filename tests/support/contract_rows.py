@@ -11,14 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
-
-#: Operations between numbers, which are unclear with a mask; ``where``, ``&`` and ``|`` are clear.
-NUMBERS = {
-    *("add", "sub", "mul", "div", "pow", "add_", "sub_", "mul_", "div_", "multiply", "true_divide", "rsub"),
-    *("__radd__", "__rsub__", "__rmul__", "__rpow__", "__rtruediv__", "matmul", "bmm", "prod"),
-}
 
 #: The promises a row can make.
 PROMISES = ("dtype", "batch", "vmap", "capture", "gradcheck", "empty", "shuffle", "padding", "nan", "raises")
@@ -71,14 +64,3 @@ def equal(a: Any, b: Any, atol: float | None = None) -> None:
             assert same.all(), f"leaf {k}: {(~same).sum()} of {same.numel()} differ"
         else:
             torch.testing.assert_close(x, y, rtol=1e-5, atol=atol, equal_nan=True, msg=lambda m, k=k: f"leaf {k}: {m}")
-
-
-class NoMasksAsNumbers(TorchFunctionMode):
-    """Refuses arithmetic with a mask, of a tensor or of Python."""
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        """Checks the arguments before the call."""
-        masks = [x for x in args if isinstance(x, bool) or (isinstance(x, torch.Tensor) and x.dtype == torch.bool)]
-        name = getattr(func, "__name__", "")
-        assert not (masks and name in NUMBERS), f"{name} of a mask: choose with torch.where, join with & and |"
-        return func(*args, **(kwargs or {}))
