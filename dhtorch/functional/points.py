@@ -84,11 +84,9 @@ def triangulate_points_one_sided(
         >>> X, covariance[..., 2, 2].sqrt()  # depth² / (f · baseline) for 1 px
         (tensor([[0.0400, 0.0400, 2.0000]]), tensor([0.0400]))
     """
-    KORNIA_CHECK_SHAPE(points1, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(points2, ["*", "N", "2"])
-    for matrix in (K1, K2, R):
-        KORNIA_CHECK_SHAPE(matrix, ["*", "3", "3"])
-    KORNIA_CHECK_SHAPE(t, ["*", "3", "1"])
+    _check_shapes("* N 2", points1, points2)
+    _check_shapes("* 3 3", K1, K2, R)
+    _check_shapes("* 3 1", t)
     KORNIA_CHECK(points1.shape == points2.shape, f"points1 {points1.shape} and points2 {points2.shape} differ in shape")
     batch, N = points1.shape[:-2], points1.shape[-2]
     uv_1, uv_2 = _flat(points1, (), 2), _flat(points2, (), 2)
@@ -156,10 +154,8 @@ def track_points_lk(
         >>> tracks.points.round(decimals=1), tracks.valid
         (tensor([[[41.5000, 30.0000]]]), tensor([[True]]))
     """
-    for image in (image1, image2):
-        KORNIA_CHECK_SHAPE(image, ["B", "C", "H", "W"])
-    for points in (points1,) if initial is None else (points1, initial):
-        KORNIA_CHECK_SHAPE(points, ["B", "N", "2"])
+    _check_shapes("B C H W", image1, image2)
+    _check_shapes("B N 2", points1, points1 if initial is None else initial)
     KORNIA_CHECK(len(image1) == len(image2) == len(points1), "images and points differ in batch size")
     tracks = lucas_kanade(
         image1,
@@ -204,9 +200,8 @@ def solve_p3p(
         >>> bool((poses[valid] - torch.eye(3, 4)).abs().amax((-1, -2)).min() < 1e-4)
         True
     """
-    KORNIA_CHECK_SHAPE(world_points, ["*", "3", "3"])
-    KORNIA_CHECK_SHAPE(img_points, ["*", "3", "2"])
-    KORNIA_CHECK_SHAPE(intrinsics, ["*", "3", "3"])
+    _check_shapes("* 3 3", world_points, intrinsics)
+    _check_shapes("* 3 2", img_points)
     batch = world_points.shape[:-2]
     rays = cam.rays(cam.from_matrix(_flat(intrinsics, batch, 2)), _flat(img_points, batch, 2))
     R, t, valid = p3p(rays, _flat(world_points, (), 2))
@@ -261,9 +256,9 @@ def solve_pnp_ransac(
         >>> bool((solution.world_to_cam - torch.eye(3, 4)).abs().max() < 1e-4)
         True
     """
-    KORNIA_CHECK_SHAPE(world_points, ["*", "N", "3"])
-    KORNIA_CHECK_SHAPE(img_points, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(intrinsics, ["*", "3", "3"])
+    _check_shapes("* N 3", world_points)
+    _check_shapes("* N 2", img_points)
+    _check_shapes("* 3 3", intrinsics)
     KORNIA_CHECK(
         world_points.shape[:-1] == img_points.shape[:-1],
         f"world_points {world_points.shape} and img_points {img_points.shape} differ in shape",
@@ -287,6 +282,11 @@ def solve_pnp_ransac(
     return PnPSolution(
         pose.reshape(*batch, 3, 4), fit.ok.reshape(batch), fit.inlier.reshape(*batch, N), cov.reshape(*batch, 6, 6)
     )
+
+
+def _check_shapes(pattern: str, *tensors: Tensor) -> None:
+    for x in tensors:
+        KORNIA_CHECK_SHAPE(x, pattern.split())
 
 
 def _flat(x: Tensor, batch: tuple[int, ...], axes: int) -> Tensor:

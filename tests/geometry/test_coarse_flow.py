@@ -115,19 +115,6 @@ def test_pictures_of_different_things_have_no_start() -> None:
     assert start.coarse_flow(flat, flat).at(torch.zeros(1, 3, 2)).isnan().all()
 
 
-def test_a_picture_of_another_size_is_searched_at_the_size_of_the_first() -> None:
-    a, b, there = _pair(6, (30.0, 10.0))
-    large = F.interpolate(b, scale_factor=2, mode="bicubic", align_corners=False).clamp(0, 1)
-    assert torch.equal(start.coarse_flow(a, large).linear[0], 2 * torch.eye(2))
-    assert torch.equal(start.coarse_flow(large, a).linear[0], 0.5 * torch.eye(2))
-    known = start.coarse_flow(a, large, linear=2 * torch.eye(2)[None])
-    assert torch.equal(known.uv_1, start.coarse_flow(a, large).uv_1)
-    uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0], [200.0, 60.0]]])
-    true = 2 * there[uv[0, :, 1].long(), uv[0, :, 0].long()] + 0.5
-    tracks = lucas_kanade_affine(a, large, uv, start=start.coarse_flow)
-    assert tracks.valid.all() and float((tracks.uv_1[0] - true).norm(dim=-1).max()) < 0.3
-
-
 def test_neighbours_tell_what_a_repeated_pattern_cannot() -> None:
     a, b, there = _pair(8, (40.0, 0.0))
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
