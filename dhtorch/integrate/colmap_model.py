@@ -39,13 +39,6 @@ MODEL_FILES = ("cameras.txt", "images.txt", "points3D.txt", "times.txt")
 #: Source: COLMAP's default for its own points (``filter_max_reproj_error`` = 4).
 _MAX_REPROJECTION_PX = 4.0
 
-#: Most swept points of a picture: a map has a hundred times more, which no trainer needs to start from.
-#: Source: chosen as a few times the samples of a view, 500 to 2000.
-_MAX_SWEPT_POINTS = 4000
-
-#: COLMAP's error of a point without one: nothing was triangulated.
-_NO_ERROR = -1.0
-
 
 class _Points(NamedTuple):
     """Points with their observations in up to two pictures."""
@@ -147,7 +140,9 @@ def _sample_points(
     agrees = observed & (distance <= _MAX_REPROJECTION_PX)
     count = agrees.sum(1)
     keep = ((source == Source.SENSOR) & agrees[:, 0]) | ((source == Source.RECOVERED) & (count == 2))
-    error = torch.where(count == 2, torch.where(agrees, distance, 0.0).sum(1) / 2, _NO_ERROR)
+    error = torch.where(
+        count == 2, torch.where(agrees, distance, 0.0).sum(1) / 2, -1.0
+    )  # COLMAP's of a point without one
     seen_by = torch.where(agrees, torch.tensor(views), -1)
     outliers = int((observed & (distance > _MAX_REPROJECTION_PX))[source != Source.NONE].sum())
     return _Points(*(x[keep] for x in (world, answer.rgb[0], error, seen_by, uv))), outliers
@@ -160,7 +155,8 @@ def _swept_points(
     assert answer.swept is not None
     depth = answer.swept.read()[0].flatten()
     chosen = (depth > 0).nonzero()[:, 0]
-    chosen = chosen[:: max(1, -(-len(chosen) // _MAX_SWEPT_POINTS))]
+    # 4000 at most, a few times the samples of a view: a map has a hundred times more than trainers start from.
+    chosen = chosen[:: max(1, -(-len(chosen) // 4000))]
     uv = map_pixel_centres(frame, answer.swept.hw)[chosen]
     shot = number[answer.pair[0]]
     world = _to_world(answer, uv[None], depth[None, chosen], shots[shot])
@@ -172,7 +168,7 @@ def _swept_points(
     points = _Points(
         world,
         rgb,
-        torch.full((len(uv),), _NO_ERROR, dtype=world.dtype),
+        torch.full((len(uv),), -1.0, dtype=world.dtype),
         torch.tensor([[shot, -1]]).expand(len(uv), 2),
         torch.stack((pixels, torch.full_like(pixels, torch.nan)), 1),
     )

@@ -20,13 +20,6 @@ from dhtorch.integrate.sweeps import depth_step_rel
 from dhtorch.integrate.volume import DepthView, Volume, drop_unconfirmed, fuse_views, make_volume, reserve_blocks
 from dhtorch.records import Pose
 
-#: Swept maps that must agree on a surface without other depth; if there are fewer maps, all of them.
-_MIN_AGREEING_MAPS = 2
-
-#: Largest over smallest depth in 3×3 pixels, minus one, above which a pixel is left out: it lies beside a depth step.
-_MAX_DEPTH_STEP_REL = 0.1
-
-
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 
@@ -61,10 +54,16 @@ def fuse_frame_maps(
     Raises:
         ValueError: no frame that could be placed.
     """
-    poses = _finite_poses(recording, frames)
+    if recording.poses is None:
+        poses = {k: se3.identity(1, torch.zeros((), dtype=torch.float64)) for k in frames[:1]}
+    else:
+        poses = {k: recording.poses[k : k + 1].to(torch.float64) for k in frames}
+    poses = {k: T for k, T in poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
     if not poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    coarse_voxel = choose_coarse_voxel(voxel, _swept_sigmas([read(k) for k in list(poses)[:N_MAPS_FOR_VOXEL]]))
+    maps = [read(k) for k in list(poses)[:N_MAPS_FOR_VOXEL]]
+    sigmas = torch.cat([m.sigma[is_estimated(m.source) & (m.depth > 0)] for m in maps])
+    coarse_voxel = choose_coarse_voxel(voxel, sigmas)
     volumes = [make_volume(voxel), *([] if coarse_voxel is None else [make_volume(coarse_voxel)])]
     volumes = _fuse_sources(recording, poses, read, volumes, progress=progress)
     surface = reduce(merge_surfaces, map(extract_points, volumes))
@@ -103,26 +102,14 @@ def _fuse_sources(
     *finer, last = volumes
     for view, source in views(Source.SWEPT):
         last = fuse(last, view, source=source)
-    return [*finer, drop_unconfirmed(last, min(_MIN_AGREEING_MAPS, len(poses)))]
-
-
-def _swept_sigmas(maps: Sequence[FrameMap]) -> Tensor:
-    """Standard deviations (P,) m of the swept pixels."""
-    return torch.cat([m.sigma[is_estimated(m.source) & (m.depth > 0)] for m in maps])
-
-
-def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
-    if recording.poses is None:
-        return {k: se3.identity(1, torch.zeros((), dtype=torch.float64)) for k in frames[:1]}
-    poses = {k: recording.poses[k : k + 1].to(torch.float64) for k in frames}
-    return {k: T for k, T in poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
+    return [*finer, drop_unconfirmed(last, min(2, len(poses)))]  # maps that agree on a surface without other depth
 
 
 def _make_view(recording: Recording, k: int, frame_map: FrameMap, source: int, T_world_from_cam: Pose) -> DepthView:
     """Depth view of the pixels of one source, without those beside a depth step."""
     depth, sigma = frame_map.depth[None], frame_map.sigma[None]
     chosen = is_estimated(frame_map.source) if source == Source.SWEPT else frame_map.source == source
-    keep = chosen[None] & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= _MAX_DEPTH_STEP_REL)
+    keep = chosen[None] & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= 0.1)
     depth = torch.where(keep, depth, 0.0)
     score = torch.where(keep, 0.1 / (0.1 + sigma / torch.where(keep, depth, 1.0)), 0.0)
     return view_from_depth_map(recording[k], depth, sigma, score, T_world_from_cam=T_world_from_cam)

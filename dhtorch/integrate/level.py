@@ -24,21 +24,8 @@ _UP_BY_FORMAT = {
 #: sideways, and a phone above a table looks straight down.
 _LEVEL_FORMATS = frozenset({"stray", "arkitscenes", "synthetic"})
 
-#: In the other formats a trajectory may have been moved to its first camera: a direction whose angle to
-#: the cameras' mean upward direction has a smaller cosine is not used.
-_MIN_UP_COSINE = 0.5
-
-#: Number of planes tried, and the fraction of the points that the floor must contain.
-_N_FLOOR_TRIALS, _MIN_FLOOR_SHARE = 300, 0.1
-
 #: Least cosine of the angle between an upward direction and its first guess: of 40°.
 _MIN_GUESS_COSINE = 0.77
-
-#: Number of directions tried on the whole sphere, about 2° apart; standard deviation of a surface's lean, rad (5°).
-_N_DIRECTIONS, _LEAN_SIGMA_RAD = 12000, 0.087
-
-#: Least score of an upward direction from walls and levels: twice that of surfaces with random normals.
-_MIN_UPRIGHT_SCORE = 0.25
 
 
 def estimate_up(
@@ -63,22 +50,19 @@ def estimate_up(
     """
     mean = mean_camera_up(poses)
     gravity_axis = _UP_BY_FORMAT.get(recording.format)
-    if gravity_axis is not None and _is_in_own_world(recording, poses):
+    own_world = False  # or poses chained from pairs
+    if recording.poses is not None and poses:
+        off = (recording.poses.R - poses[0].R.to(recording.poses.R)).abs().flatten(1).amax(1)
+        own_world = bool((off < 1e-5).any())
+    if gravity_axis is not None and own_world:
         axis = torch.tensor(gravity_axis, dtype=torch.float64)
-        if recording.format in _LEVEL_FORMATS or float(axis @ mean) > _MIN_UP_COSINE:
+        # In the other formats a trajectory may have been moved to its first camera: no axis 60° off the cameras' mean.
+        if recording.format in _LEVEL_FORMATS or float(axis @ mean) > 0.5:
             return axis.tolist()
     up = _fit_floor_normal(xyz.double(), mean, thickness)
     if up is None and normal is not None:
         up = _fit_upright_direction(normal.double(), mean)
     return (mean if up is None else up).tolist()
-
-
-def _is_in_own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
-    """Whether the frames have poses of the recording's trajectory, not poses chained from pairs."""
-    if recording.poses is None or not poses:
-        return False
-    off = (recording.poses.R - poses[0].R.to(recording.poses.R)).abs().flatten(1).amax(1)
-    return bool((off < 1e-5).any())
 
 
 def mean_camera_up(poses: Sequence[Pose]) -> Tensor:
@@ -95,7 +79,7 @@ def _fit_floor_normal(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | 
         return None
     draw = torch.Generator().manual_seed(0)
     subset = xyz[torch.randint(len(xyz), (min(len(xyz), 5000),), generator=draw)]
-    triples = subset[torch.randint(len(subset), (_N_FLOOR_TRIALS, 3), generator=draw)]
+    triples = subset[torch.randint(len(subset), (300, 3), generator=draw)]
     normal = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=-1)
     normal = normal * torch.where(normal @ guess < 0, -1.0, 1.0)[:, None]
@@ -103,7 +87,7 @@ def _fit_floor_normal(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | 
     distance = (subset @ normal.T - (triples[:, 0] * normal).sum(-1)).abs()
     count = torch.where(level, (distance < thickness).sum(0), 0)
     largest = int(count.argmax())
-    if int(count[largest]) < _MIN_FLOOR_SHARE * len(subset):
+    if int(count[largest]) < 0.1 * len(subset):
         return None
     inliers = subset[distance[:, largest] < thickness]
     axis = torch.linalg.eigh((inliers - inliers.mean(0)).T @ (inliers - inliers.mean(0))).eigenvectors[:, 0]
@@ -125,20 +109,19 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     subset = torch.nn.functional.normalize(
         normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)]
     )
-    axes = _spiral_directions(_N_DIRECTIONS)
+    axes = _spiral_directions(12000)  # about 2° apart
     axes = axes[axes @ guess > _MIN_GUESS_COSINE]
     upright = torch.asin((subset @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
-    score = (
-        torch.exp(-0.5 * (upright / _LEAN_SIGMA_RAD) ** 2) + torch.exp(-0.5 * (level / _LEAN_SIGMA_RAD) ** 2)
-    ).mean(0)
+    # A surface leans by 5°; twice the score of surfaces with random normals is enough.
+    score = sum(torch.exp(-0.5 * (angle / 0.087) ** 2) for angle in (upright, level)).mean(0)
     best = int(score.argmax())
-    return axes[best] if float(score[best]) >= _MIN_UPRIGHT_SCORE else None
+    return axes[best] if float(score[best]) >= 0.25 else None
 
 
-def _spiral_directions(count: int) -> Tensor:
-    """Unit vectors (count, 3) spread evenly over the sphere, along a spiral."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))
+def _spiral_directions(n: int) -> Tensor:
+    """Unit vectors (n, 3) spread evenly over the sphere, along a spiral."""
+    k = torch.arange(n, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * k / n, k * math.pi * (3 - math.sqrt(5))
     r = (1 - z * z).sqrt()
     return torch.stack((r * turn.cos(), r * turn.sin(), z), -1)

@@ -41,9 +41,6 @@ Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 PairSelector = Callable[[Scene], Iterable[Pair]]
 
-#: Least and largest edge of a voxel that is chosen from the depth, m.
-_MIN_VOXEL_M, _MAX_VOXEL_M = 0.005, 0.2
-
 #: Option groups whose chosen names are stored in the result.
 _CONFIG_GROUPS = ("method", "data", "pairs")
 
@@ -100,33 +97,26 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     with open_output_folder(folder, "output") as output:
         output.check([folder / "result.json", *(folder / each.name / name for each in sources for name in _MAP_FILES)])
         output.check_folders([folder / each.name / "colmap" / IMAGE_FOLDER for each in sources])
-        return _write_maps(sources, folder, settings, parts, progress)
-
-
-def _write_maps(
-    sources: Sequence[Scene], folder: Path, settings: Mapping[str, Any], parts: Mapping[str, Any], progress: Progress
-) -> int:
-    """Map the scenes, write their files and the result; returns the exit code."""
-    began = time.perf_counter()
-    scene_rows: list[Row] = []
-    rows: list[Row] = []
-    written: list[Path] = []
-    try:
-        for source in sources:
-            mapped = map_scene(source, parts["method"], parts["pairs"], settings, progress=progress)
-            written += write_mapped_scene(folder / source.name, mapped, settings)
-            mapped.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scene_rows)
-            scene_rows.append(mapped.row)
-            rows += [*_pair_rows(mapped), mapped.row]
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"{len(scene_rows)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
-        ) from None
-    result = _build_result(settings, sources, rows, scene_rows)
-    result_files.write_result(folder / "result.json", result)
-    print("\n".join(_describe_scene(row, row["cell_m"]) for row in scene_rows))
-    print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
-    return 0
+        began = time.perf_counter()
+        scene_rows: list[Row] = []
+        rows: list[Row] = []
+        written: list[Path] = []
+        try:
+            for source in sources:
+                mapped = map_scene(source, parts["method"], parts["pairs"], settings, progress=progress)
+                written += write_mapped_scene(folder / source.name, mapped, settings)
+                mapped.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scene_rows)
+                scene_rows.append(mapped.row)
+                rows += [*_pair_rows(mapped), mapped.row]
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"{len(scene_rows)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
+            ) from None
+        result = _build_result(settings, sources, rows, scene_rows)
+        result_files.write_result(folder / "result.json", result)
+        print("\n".join(_describe_scene(row, row["cell_m"]) for row in scene_rows))
+        print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
+        return 0
 
 
 def map_scene(
@@ -147,7 +137,10 @@ def map_scene(
         scene, method, chosen, sweep=sweep, shelf=SweepStore(Path(settings["output"])), **options
     )
     answers = list(progress(estimates, f"{recording.name}: pairs", len(chosen)))
-    links = _linking_pairs(answers) if settings["poses"] == "anchored" else []
+    links: list[tuple[int, int]] = []
+    if settings["poses"] == "anchored":
+        tracked = [(a.pair[0], k) for a in answers for k in a.links]
+        links = recordings.linking_pairs(tracked, chosen=any(a.picked is not None for a in answers))
     link_estimates = recordings.estimate_pairs(scene, method, links, **options)
     all_answers = [*answers, *progress(link_estimates, f"{recording.name}: links", len(links))]
     places = recordings.place_frames(recording, all_answers, poses=settings["poses"])
@@ -161,10 +154,13 @@ def map_scene(
         )
     row: Row = {"scene": recording.name, "pair": None, "method": _method_name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "cutoff_m": settings["cutoff"], "n_pairs": len(chosen), "n_frames": len(places.poses)}
-    row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
+    row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced}
+    row |= {"n_recovered": sum(int(answer.recovered.sum()) for answer in answers)}
     row |= {} if sweep is None else _count_swept([a.swept for a in answers if a.swept is not None])
     row |= _coverage_columns(points, volumes[-1].voxel)
-    row |= _count_points(surface) | {"recovered_sigma_rel": _median_sigma_rel(answers)}
+    kinds = count_kinds(surface.source.bincount(minlength=len(names(Source))).tolist())
+    row |= {f"n_points_{kind}": n for kind, n in kinds.items() if kind != "no_answer"}
+    row |= {"recovered_sigma_rel": _median_sigma_rel(answers)}
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
     row |= {"volume_mib": sum(v.bytes for v in volumes) / 2**20}
     row |= {"voxel_m": settings["voxel"], "cell_m": volumes[-1].voxel}
@@ -186,7 +182,7 @@ def choose_voxel(recording: Recording, frames: Sequence[int] | None = None) -> f
             f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if depth_f is None else depth_f
             sizes.append(float(depth.median() / f.mean()))
     voxel = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
-    return float(f"{min(max(voxel, _MIN_VOXEL_M), _MAX_VOXEL_M):.2g}")
+    return float(f"{min(max(voxel, 0.005), 0.2):.2g}")
 
 
 def _fuse_sources(
@@ -203,36 +199,25 @@ def _fuse_sources(
     stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
     stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
     points: dict[str, integrate.Surface] = {}
-    wide_voxel = choose_coarse_voxel(settings["voxel"], _swept_sigmas(answers))
-
-    def points_of(volume: integrate.Volume) -> integrate.Surface:
-        return integrate.extract_points(volume, min_weight=settings["min_weight"])
+    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
+    sigmas = [sigma[depth > 0] for depth, sigma, *_ in maps]
+    sigmas = sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)]
+    wide_voxel = choose_coarse_voxel(settings["voxel"], torch.cat(sigmas))
 
     def keep_points(source: int, volumes: list[integrate.Volume]) -> None:
-        if source == Source.SENSOR or wide_voxel is None:
-            points[stages[source]] = points_of(volumes[0])
-        else:
-            points[stages[source]] = merge_surfaces(points["sensor"], points_of(volumes[-1]))
+        is_fine = source == Source.SENSOR or wide_voxel is None
+        surface = integrate.extract_points(volumes[0 if is_fine else -1], min_weight=settings["min_weight"])
+        points[stages[source]] = surface if is_fine else merge_surfaces(points["sensor"], surface)
 
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps", "weight")} | {"progress": progress}
-    options |= {
-        "sigma_m": settings["sensor_sigma_m"],
-        "sigma_rel": settings["sensor_sigma_rel"],
-        "max_reach": MAX_REACH_TRUNCATIONS,
-    }
+    options |= {name: settings[f"sensor_{name}"] for name in ("sigma_m", "sigma_rel")}
+    options |= {"max_reach": MAX_REACH_TRUNCATIONS}
     empty = [integrate.make_volume(settings["voxel"], truncation=settings["truncation"])]
     empty += [] if wide_voxel is None else [integrate.make_volume(wide_voxel)]
     volumes = recordings.fuse_recording_grids(
         recording, empty, answers, places, sources=list(stages), after=keep_points, **options
     )
     return volumes, points
-
-
-def _swept_sigmas(answers: Sequence[PairEstimate]) -> Tensor:
-    """Standard deviations (P,) m of the swept depth of the first maps; without maps, of the recovered points."""
-    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
-    sigmas = [sigma[depth > 0] for depth, sigma, *_ in maps]
-    return torch.cat(sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)])
 
 
 def _median_sigma_rel(answers: Sequence[PairEstimate]) -> float | None:
@@ -242,12 +227,6 @@ def _median_sigma_rel(answers: Sequence[PairEstimate]) -> float | None:
     ratios = ratios or [(a.estimate.sigma / a.estimate.depth)[a.recovered] for a in answers]
     ratio = torch.cat([torch.zeros(0), *ratios])
     return float(ratio.median()) if len(ratio) else None
-
-
-def _count_points(surface: integrate.Surface) -> Row:
-    """Numbers of points by kind of their source."""
-    kinds = count_kinds(surface.source.bincount(minlength=len(names(Source))).tolist())
-    return {f"n_points_{kind}": n for kind, n in kinds.items() if kind != "no_answer"}
 
 
 def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
@@ -371,12 +350,6 @@ def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
     return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
 
 
-def _linking_pairs(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
-    """Further pairs that link the frames to one another."""
-    pairs = [(a.pair[0], k) for a in answers for k in a.links]
-    return recordings.linking_pairs(pairs, chosen=any(a.picked is not None for a in answers))
-
-
 def _pair_rows(scene: MappedScene) -> list[Row]:
     common = {k: scene.row[k] for k in ("scene", "method", "truth")}
     return [
@@ -408,10 +381,6 @@ def _describe_scene(row: Row, cell: float) -> str:
         f" {format_count(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{ratio}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
     )
-
-
-def _n_recovered(answers: Iterable[PairEstimate]) -> int:
-    return sum(int(answer.recovered.sum()) for answer in answers)
 
 
 def _count_swept(maps: Sequence[StoredSweep]) -> Row:
@@ -480,6 +449,6 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     if settings["mesh"] and not should_mesh(None):
         raise ImportError("mesh: found no scikit-image, expected it: pip install scikit-image")
     integrate.extract_points(
-        integrate.make_volume(settings["voxel"] or _MIN_VOXEL_M, truncation=settings["truncation"]),
+        integrate.make_volume(settings["voxel"] or 0.005, truncation=settings["truncation"]),
         min_weight=settings["min_weight"],
     )

@@ -43,9 +43,6 @@ from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tra
 
 POSE_SOURCES = ("device", "anchored")
 
-#: Radius of a recovered point's patch, in voxels.
-_PATCH_RADIUS_VOXELS = 1.5
-
 
 @dataclass(frozen=True)
 class PairEstimate:
@@ -158,7 +155,8 @@ def place_frames(recording: Recording, answers: Sequence[PairEstimate], *, poses
     if poses not in POSE_SOURCES:
         raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSE_SOURCES)}")
     frames = sorted({k for answer in answers for k in (answer.pair[0], *answer.links)})
-    own_poses = {} if recording.poses is None else {k: _own_pose(recording, k) for k in frames}
+    trajectory = recording.poses
+    own_poses = {} if trajectory is None else {k: trajectory[k : k + 1].to(torch.float64) for k in frames}
     own_poses = {k: T for k, T in own_poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
     if poses == "device":
         if recording.poses is None:
@@ -260,13 +258,20 @@ def fuse_recording_grids(
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
             *finer, volume = (
-                _fuse_sensor(v, frame, places.poses[k], recording.sparse, noise, weight) for v in (*finer, volume)
+                fuse_views(
+                    v,
+                    view_from_sensor(
+                        frame, places.poses[k], radius=1.5 * v.voxel if recording.sparse else None, **noise
+                    ),
+                    weight=weight,
+                )
+                for v in (*finer, volume)
             )
         after(Source.SENSOR, [*finer, volume])
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
-            view = view_from_recovered(answer, places.poses[answer.pair[0]], radius=_PATCH_RADIUS_VOXELS * volume.voxel)
+            view = view_from_recovered(answer, places.poses[answer.pair[0]], radius=1.5 * volume.voxel)
             volume = fuse(volume, view, source=Source.RECOVERED)
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
@@ -276,14 +281,6 @@ def fuse_recording_grids(
         volume = drop_unconfirmed(volume, max(1, min(min_maps, len(maps))))
         after(Source.SWEPT, [*finer, volume])
     return [*finer, volume]
-
-
-def _fuse_sensor(
-    volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any], weight: str
-) -> Volume:
-    """The volume after fusion of one frame's sensor depth."""
-    radius = _PATCH_RADIUS_VOXELS * volume.voxel if sparse else None
-    return fuse_views(volume, view_from_sensor(frame, T_world_from_cam, radius=radius, **noise), weight=weight)
 
 
 def measure_coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
@@ -326,9 +323,8 @@ def view_from_sensor(
     v, u = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in hw), indexing="ij")
     uv = torch.stack((u, v), -1).view(1, -1, 2).to(depth)
     same = frame.depth_camera is None and hw == frame.hw
-    features = torch.cat(
-        (_sample_colours(frame, uv if same else _depth_to_image_uv(frame, camera, uv)), score.view(1, -1, 1)), -1
-    )
+    seen = uv if same else cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())
+    features = torch.cat((_sample_colours(frame, seen), score.view(1, -1, 1)), -1)
     if radius is not None:
         index = (depth.flatten() > 0).nonzero()[:, 0]
         values = (uv[:, index], depth.flatten(1)[:, index], sigma.flatten(1)[:, index], features[:, index])
@@ -376,11 +372,6 @@ def view_from_depth_map(
     return DepthView(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
-def _own_pose(recording: Recording, k: int) -> Pose:
-    assert recording.poses is not None
-    return recording.poses[k : k + 1].to(torch.float64)
-
-
 def chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
     """Poses of all frames that links connect to the first one, each along the fewest links."""
     poses, queue = {first: start}, deque([first])
@@ -398,8 +389,3 @@ def _sample_colours(frame: Frame, uv: Tensor) -> Tensor:
     image = frame.image[0].expand(3, -1, -1)
     value = sample_nearest(image, uv.expand(3, -1, -1))[0].T[None]
     return value.to(uv) / 255 if image.dtype == torch.uint8 else value
-
-
-def _depth_to_image_uv(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
-    """Pixels (1, N, 2) of the image that correspond to pixels ``uv`` of the depth map."""
-    return cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())

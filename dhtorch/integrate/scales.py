@@ -13,14 +13,10 @@ from torch import Tensor
 from dhtorch.codes import Source
 from dhtorch.integrate.surface import Surface
 
-#: Voxels of the coarse grid per median sigma of its depth.
-_VOXELS_PER_SIGMA = 4
 #: Largest twofold sigma of depth that is fused, in truncations of the grid.
 MAX_REACH_TRUNCATIONS = 5.0
 #: Maps whose sigmas determine the size of the coarse voxels.
 N_MAPS_FOR_VOXEL = 5
-#: Ratio of coarse to fine voxel up to which a single grid is used.
-_MIN_COARSE_RATIO = 1.5
 
 
 def choose_coarse_voxel(voxel: float, sigma: Tensor) -> float | None:
@@ -29,8 +25,8 @@ def choose_coarse_voxel(voxel: float, sigma: Tensor) -> float | None:
     Gradient: none.
     """
     usable = sigma[sigma.isfinite() & (sigma > 0)]
-    coarse = float(usable.median()) / _VOXELS_PER_SIGMA if len(usable) else 0.0
-    return float(f"{coarse:.2g}") if coarse > _MIN_COARSE_RATIO * voxel else None
+    coarse = float(usable.median()) / 4 if len(usable) else 0.0
+    return float(f"{coarse:.2g}") if coarse > 1.5 * voxel else None
 
 
 def merge_surfaces(fine: Surface, wide: Surface) -> Surface:

@@ -20,10 +20,6 @@ _MAX_STEP_TRUNCATIONS = 1.5
 _BRICK_BLOCKS = 8
 #: Bits of a voxel's position within its block, per axis. Source: derived, log2 of BLOCK_SIDE.
 _SIDE_BITS = BLOCK_SIDE.bit_length() - 1
-#: Points whose attributes are interpolated at a time; bounds the memory.
-_POINTS_PER_CHUNK = 1 << 18
-#: Distance to a voxel, in voxels, below which a vertex of the mesh counts as lying on it.
-_SNAP_VOXELS = 1e-4
 
 
 @record
@@ -50,7 +46,6 @@ def extract_points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
 
     Gradient: none.
     """
-    _check_volume(min_weight)
     table = _VoxelTable(volume, min_weight)
     edges = [_crossing_edges(table, axis) for axis in range(3)]
     a, b = (torch.cat([pair[k] for pair in edges]) for k in (0, 1))
@@ -79,7 +74,6 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     Gradient: none.
     Source: T. Lewiner et al. 2003, as implemented by scikit-image.
     """
-    _check_volume(min_weight)
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
@@ -87,7 +81,11 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     table = _VoxelTable(volume, min_weight)
     vertices, faces, count = [], [], 0
     for origin, distance, observed in _dense_bricks(table):
-        cell = _meshable_cells(distance, observed, _MAX_STEP_TRUNCATIONS * volume.truncation)
+        # Cells (n - 1)³ of which every corner is observed and no edge is a rim.
+        cell = _both_ends(observed, 0, 1, 2)
+        for dim in range(3):
+            is_rim = distance.diff(dim=dim).abs() > _MAX_STEP_TRUNCATIONS * volume.truncation
+            cell &= _both_ends(~is_rim, *({0, 1, 2} - {dim}))
         if not bool(cell.any()):
             continue
         mask = torch.nn.functional.pad(cell, (1, 0) * 3)  # marching_cubes reads the mask at the far corner of a cell
@@ -111,7 +109,7 @@ def _weld_vertices(table: _VoxelTable, vertices: Tensor, faces: Tensor) -> Surfa
     """Surface of a mesh (vertices in voxels) with one vertex per grid edge and without degenerate triangles."""
     volume, device = table.volume, table.volume.key.device
     rounded = vertices.round()
-    on_voxel = (vertices - rounded).abs() < _SNAP_VOXELS
+    on_voxel = (vertices - rounded).abs() < 1e-4
     a = torch.where(on_voxel, rounded, vertices.floor()).long()
     b = torch.where(on_voxel, rounded, vertices.ceil()).long()
     cells, vertex_of = sparse_grid.pack_cells(a + b).unique(return_inverse=True)
@@ -126,7 +124,8 @@ def _weld_vertices(table: _VoxelTable, vertices: Tensor, faces: Tensor) -> Surfa
 
 def _interpolate(table: _VoxelTable, numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     """Surface points at fractions ``t`` (P,) between two voxels each, ``numbers`` (2, P), computed in chunks."""
-    parts = zip(*(x.split(_POINTS_PER_CHUNK, -1) for x in (numbers, t)), xyz.split(_POINTS_PER_CHUNK), strict=True)
+    n = 1 << 18  # points of a chunk: bounds the memory
+    parts = zip(*(x.split(n, -1) for x in (numbers, t)), xyz.split(n), strict=True)
     return collate(_interpolate_chunk(table, *part) for part in parts)
 
 
@@ -154,6 +153,8 @@ class _VoxelTable:
     all absent ones. Blocks side by side are looked up once."""
 
     def __init__(self, volume: Volume, min_weight: float) -> None:
+        if not min_weight >= 0:
+            raise ValueError(f"integrate: min_weight is {min_weight}, expected 0 or more")
         self.volume = volume
         total = volume.weight.sum(-1)
         self.distance = self._pad(torch.where(total > 0, volume.distance, torch.nan))  # NaN = unobserved
@@ -162,13 +163,11 @@ class _VoxelTable:
             self.chosen = self._pad(torch.where(total >= min_weight, volume.distance, torch.nan))
         self._slots = torch.arange(len(volume.key) + 1, device=volume.key.device)
         self._position = sparse_grid.unpack_cells(volume.key)
-        self._next = {(axis, sign): self._next_slots(axis, sign) for axis in range(3) for sign in (1, -1)}
-
-    def _next_slots(self, axis: int, sign: int) -> Tensor:
-        """Slot (K + 1,) of the block beside each block; K = absent."""
-        wanted = self._position.clone()
-        wanted[:, axis] += sign
-        return torch.cat((self._slot(wanted), self._slots[-1:]))
+        # Slot (K + 1,) of the block beside each block; K = absent.
+        steps = {(axis, sign): torch.zeros_like(self._position[:1]) for axis in range(3) for sign in (1, -1)}
+        for (axis, sign), step in steps.items():
+            step[:, axis] = sign
+        self.next = {k: torch.cat((self._slot(self._position + step), self._slots[-1:])) for k, step in steps.items()}
 
     def _pad(self, x: Tensor) -> Tensor:
         """(K, 512) -> (K + 1, 512), the last NaN."""
@@ -188,10 +187,6 @@ class _VoxelTable:
         """Distances (…,) m of voxels; NaN where unobserved."""
         return self.distance.flatten()[number]
 
-    def beyond(self, axis: int) -> Tensor:
-        """Slots (K,) of the next blocks along an axis; K = absent."""
-        return self._next[axis, 1][:-1]
-
     def gradient(self, number: Tensor) -> Tensor:
         """Gradient (…, 3) of the distance per voxel: central differences, one-sided beside unobserved voxels."""
         here = self.at(number)
@@ -207,7 +202,7 @@ class _VoxelTable:
         """Numbers (…,) of the voxels one step (±1) along an axis."""
         bits = _SIDE_BITS * (2 - axis)
         last = BLOCK_SIDE - 1 if sign > 0 else 0
-        jump = (self._next[axis, sign] - self._slots) * BLOCK_VOXELS - (sign * (BLOCK_SIDE - 1) << bits)
+        jump = (self.next[axis, sign] - self._slots) * BLOCK_VOXELS - (sign * (BLOCK_SIDE - 1) << bits)
         is_last = (number >> bits) & (BLOCK_SIDE - 1) == last
         return number + torch.where(is_last, jump[number >> 3 * _SIDE_BITS], sign << bits)
 
@@ -218,7 +213,7 @@ def _crossing_edges(table: _VoxelTable, axis: int) -> tuple[Tensor, Tensor]:
     step = torch.nn.functional.one_hot(torch.tensor(axis, device=volume.key.device), 3)
     chosen = table.chosen.view(-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     distance = chosen[:-1]
-    beyond = chosen.narrow(dim, 0, 1)[table.beyond(axis)]
+    beyond = chosen.narrow(dim, 0, 1)[table.next[axis, 1][:-1]]
     next_distance = torch.cat((distance.narrow(dim, 1, BLOCK_SIDE - 1), beyond), dim)
     crossing = ((distance > 0) != (next_distance > 0)) & (
         (distance - next_distance).abs() <= _MAX_STEP_TRUNCATIONS * volume.truncation
@@ -253,22 +248,9 @@ def _dense_bricks(table: _VoxelTable):
         yield first.double() * BLOCK_SIDE, dense[:n, :n, :n].contiguous(), dense_observed[:n, :n, :n]
 
 
-def _meshable_cells(distance: Tensor, observed: Tensor, max_step: float) -> Tensor:
-    """Cells (n - 1)³ of which every corner is observed and no edge is a rim."""
-    ok = _both_ends(observed, 0, 1, 2)
-    for dim in range(3):
-        ok &= _both_ends(~(distance.diff(dim=dim).abs() > max_step), *({0, 1, 2} - {dim}))
-    return ok
-
-
 def _both_ends(x: Tensor, *dims: int) -> Tensor:
     """Mask of grid points -> mask of the steps between neighbours along ``dims``, True where both ends are."""
     for dim in dims:
         n = x.shape[dim] - 1
         x = x.narrow(dim, 0, n) & x.narrow(dim, 1, n)
     return x
-
-
-def _check_volume(min_weight: float) -> None:
-    if not min_weight >= 0:
-        raise ValueError(f"integrate: min_weight is {min_weight}, expected 0 or more")

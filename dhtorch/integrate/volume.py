@@ -25,8 +25,6 @@ from dhtorch.records import Camera, Pose
 #: Voxels along the side of a block, and in a block.
 BLOCK_SIDE = 8
 BLOCK_VOXELS = BLOCK_SIDE**3
-#: Blocks updated at a time; bounds the memory of intermediate results.
-_BLOCKS_PER_CHUNK = 1024
 #: Sources of depth with separate weights, in the order of ``Volume.weight``.
 VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT, Source.FILLED)
 #: What the weight of an observation follows: the variance of its depth, or its confidence.
@@ -252,7 +250,11 @@ class _ViewIntegrator:
         by_confidence = view.features[..., -1].flatten().nan_to_num().clamp(0, 1) / volume.voxel**2
         self.precision = torch.where(usable, 1 / sigma.square() if weight == "variance" else by_confidence, 0.0)
         self.features = torch.nn.functional.pad(view.features.reshape(h * w, -1), (1, 0), value=1.0)
-        edge = cameras.rays(view.camera, _border_pixels(h, w).to(view.camera.f)[None])[0]
+        # Pixels (…, 2) along the edge of an image
+        u, v = torch.arange(w), torch.arange(h)
+        sides = [torch.stack((u, torch.full_like(u, k)), -1) for k in (0, h - 1)]
+        sides += [torch.stack((torch.full_like(v, k), v), -1) for k in (0, w - 1)]
+        edge = cameras.rays(view.camera, torch.cat(sides).to(view.camera.f)[None])[0]
         self.extent = edge[edge.isfinite().all(-1)].abs().amax(0)[:2] if len(edge) else edge.new_zeros(2)
 
     def blocks(self) -> Tensor:
@@ -278,45 +280,42 @@ class _ViewIntegrator:
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
         local = torch.cartesian_prod(*(torch.arange(BLOCK_SIDE, device=corner.device),) * 3).double() * self.voxel
         local = (local @ self.R).to(self.depth.dtype)
-        for part in self._in_sight(corner, local).split(_BLOCKS_PER_CHUNK):
-            xyz = corner[part].to(local.dtype)[:, None] + local  # (k, 512, 3)
-            self._update(volume, part, xyz, channels, carve)
-
-    def _in_sight(self, corner: Tensor, local: Tensor) -> Tensor:
-        """Blocks (k,) that may hold a voxel in the view's field and in front of its farthest surface."""
+        # Blocks (k,) that may hold a voxel in the view's field and in front of its farthest surface
         centre = corner + local.double().mean(0)
         radius = float(local.norm(dim=-1).max())
         z = centre[:, 2]
         farthest = float((self.depth + self.reach)[self.pixel].max()) if len(self.pixel) else 0.0
         extent = self.extent.double()
         in_field = centre[:, :2].abs() <= extent * z[:, None] + radius * (1 + extent.square()).sqrt()
-        return ((z > -radius) & (z < farthest + radius) & in_field.all(-1)).nonzero()[:, 0]
-
-    def _update(self, volume: Volume, part: Tensor, xyz: Tensor, channels: Tensor, carve: bool) -> None:
-        """Update the voxels ``xyz`` (k, 512, 3) of blocks ``part``; those that the view leaves are not touched."""
-        pixel, along = self._observe(xyz)
-        updated = along > -self.reach[pixel]
-        if not carve:
-            updated &= along <= self.reach[pixel]
-        updated = updated.flatten().nonzero()[:, 0]
-        pixel, along = pixel.flatten()[updated], along.flatten()[updated]
-        voxel = (part[:, None] * BLOCK_VOXELS + torch.arange(BLOCK_VOXELS, device=part.device)).flatten()[updated]
-        reach = self.reach[pixel]
-        fade = (2 + 2 * along / reach).clamp(0, 1)
-        added = self.precision[pixel] * fade
-        weight = volume.weight.view(-1, len(VOLUME_SOURCES))
-        distance = volume.distance.view(-1)
-        old_weight, old = weight[voxel], distance[voxel]
-        total = old_weight.sum(-1) + added
-        fraction = added / torch.where(total > 0, total, 1.0)
-        distance[voxel] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
-        channel = channels[pixel]
-        weight[voxel, channel] = old_weight.gather(1, channel[:, None])[:, 0] + added
-        n_swept = volume.n_swept.view(-1)
-        confirmed = (channel >= VOLUME_SOURCES.index(Source.SWEPT)) & (along <= reach) & (fade >= 0.5)
-        n_swept[voxel] += (confirmed & (n_swept[voxel] < 255)).byte()
-        close = along.abs() <= self.truncation
-        self._average_features(volume, voxel[close], pixel[close], fraction[close, None])
+        in_sight = ((z > -radius) & (z < farthest + radius) & in_field.all(-1)).nonzero()[:, 0]
+        for part in in_sight.split(1024):  # bounds the memory; voxels that the view leaves are not touched
+            xyz = corner[part].to(local.dtype)[:, None] + local  # (k, 512, 3)
+            pixel, along = self._observe(xyz)
+            updated = along > -self.reach[pixel]
+            if not carve:
+                updated &= along <= self.reach[pixel]
+            updated = updated.flatten().nonzero()[:, 0]
+            pixel, along = pixel.flatten()[updated], along.flatten()[updated]
+            voxel = (part[:, None] * BLOCK_VOXELS + torch.arange(BLOCK_VOXELS, device=part.device)).flatten()[updated]
+            reach = self.reach[pixel]
+            fade = (2 + 2 * along / reach).clamp(0, 1)
+            added = self.precision[pixel] * fade
+            weight = volume.weight.view(-1, len(VOLUME_SOURCES))
+            distance = volume.distance.view(-1)
+            old_weight, old = weight[voxel], distance[voxel]
+            total = old_weight.sum(-1) + added
+            fraction = added / torch.where(total > 0, total, 1.0)
+            distance[voxel] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
+            channel = channels[pixel]
+            weight[voxel, channel] = old_weight.gather(1, channel[:, None])[:, 0] + added
+            n_swept = volume.n_swept.view(-1)
+            confirmed = (channel >= VOLUME_SOURCES.index(Source.SWEPT)) & (along <= reach) & (fade >= 0.5)
+            n_swept[voxel] += (confirmed & (n_swept[voxel] < 255)).byte()
+            close = along.abs() <= self.truncation
+            voxel, part_of_new = voxel[close], fraction[close, None]
+            features = volume.features.flatten(0, 1)
+            kept = features[voxel].to(part_of_new.dtype)
+            features[voxel] = (kept + part_of_new * (self.features[pixel[close]] - kept)).to(features.dtype)
 
     def _observe(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
         """Voxels (…, 3) m in camera axes -> their pixels (…,), and how far in front of the surface they lie along the
@@ -330,12 +329,6 @@ class _ViewIntegrator:
         depth = self.depth[pixel]
         along = (depth - z) * xyz.norm(dim=-1) / z.clamp_min(0.01)
         return pixel, torch.where(in_field & (depth > 0), along, -torch.inf)
-
-    def _average_features(self, volume: Volume, voxel: Tensor, pixel: Tensor, fraction: Tensor) -> None:
-        """Move the features of voxels (P,) towards those of pixels (P,) by ``fraction`` (P, 1)."""
-        features = volume.features.flatten(0, 1)
-        old = features[voxel].to(fraction.dtype)
-        features[voxel] = (old + fraction * (self.features[pixel] - old)).to(features.dtype)
 
 
 def _find_channels(source: int | Tensor, depth: Tensor) -> Tensor:
@@ -375,14 +368,6 @@ def _nearest_owner(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -
     is_nearest = depth == nearest[pixel]
     first = first.scatter_reduce(0, pixel[is_nearest], owner[is_nearest], "amin")
     return torch.where(nearest.isfinite(), first, -1)
-
-
-def _border_pixels(h: int, w: int) -> Tensor:
-    """Pixels (…, 2) along the edge of an image."""
-    u, v = torch.arange(w), torch.arange(h)
-    sides = [torch.stack((u, torch.full_like(u, k)), -1) for k in (0, h - 1)]
-    sides += [torch.stack((torch.full_like(v, k), v), -1) for k in (0, w - 1)]
-    return torch.cat(sides)
 
 
 def _check_view(volume: Volume, view: DepthView) -> None:

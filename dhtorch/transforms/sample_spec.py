@@ -144,8 +144,7 @@ class SampleSpec:
         planes = leaves.planes(self.metric_depth_key if ready else self.depth, T, signed=False)
         depths = planes if ready else self.metres([planes])[0]
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
-        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
-        has_returns, failed = _check_returns(depth, spec=self, low=low, high=high)
+        has_returns, failed = self._check_depth(depth)
         checks += failed
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
@@ -305,6 +304,11 @@ class SampleSpec:
     def _unit_m(self) -> float:
         unit = self.depth_unit
         return 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
+
+    def _check_depth(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
+        """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit."""
+        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
+        return _check_returns(depth, spec=self, low=low, high=high)
 
     def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
         """Probed depths (B, k) -> checks of their median; none if all medians lie within the limits."""

@@ -1,6 +1,7 @@
 """Global integration: on scenes that are known exactly, against Open3D, and by what must never happen."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -21,13 +22,11 @@ from dhtorch.integrate import (
     extract_mesh,
     extract_points,
     fuse_views,
-    level,
     make_volume,
     recording,
     splat_points,
     sweeps,
 )
-from dhtorch.pipeline import dense
 from dhtorch.pytree import collate
 from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
 from dhtorch.stages.holes import classify
@@ -124,32 +123,23 @@ def room():
     return seen_from_four_places((144, 192), 0.03)
 
 
-def test_the_furnished_room_is_found_exactly_and_completely(room):
+def test_the_furnished_room_is_found_exactly_and_completely_and_nothing_where_nothing_was_seen(room):
     pytest.importorskip("skimage")
     _, volume, seen = room
-    surface = extract_mesh(volume)
-    error = room_distance(surface.xyz)
+    meshed, crossings = extract_mesh(volume), extract_points(volume)
+    error = room_distance(meshed.xyz)
     assert float(error.median()) < 0.002 and float(error.mean()) < 0.006 and float(error.quantile(0.99)) < 0.05
-    there, found = sparse_grid.occupied_cells(seen, 0.03), sparse_grid.occupied_cells(surface.xyz, 0.03)
-    assert float(sparse_grid.touches_cells(there, found).double().mean()) > 0.97, (
-        "complete: what was seen is in the map"
-    )
+    cells, reach = sparse_grid.occupied_cells, volume.truncation + volume.voxel
 
+    def near(xyz, others, side):
+        """Fraction of the occupied cells that touch those of others."""
+        return float(sparse_grid.touches_cells(cells(xyz, side), cells(others, side)).double().mean())
 
-def test_no_surface_where_nothing_was_seen(room):
-    pytest.importorskip("skimage")
-    _, volume, seen = room
-    reach = sparse_grid.occupied_cells(seen, volume.truncation + volume.voxel)
-    for surface in (extract_mesh(volume), extract_points(volume)):
-        assert bool(
-            sparse_grid.touches_cells(
-                sparse_grid.occupied_cells(surface.xyz, volume.truncation + volume.voxel), reach
-            ).all()
-        )
-        near = sparse_grid.touches_cells(
-            sparse_grid.occupied_cells(surface.xyz, 0.03), sparse_grid.occupied_cells(seen, 0.03)
-        )
-        assert float(near.double().mean()) > 0.97, "nor far beside what was seen"
+    assert near(seen, meshed.xyz, 0.03) > 0.97, "complete: what was seen is in the map"
+    for surface in (meshed, crossings):
+        assert near(surface.xyz, seen, reach) == 1 and near(surface.xyz, seen, 0.03) > 0.97
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 4 * 4 + 1 + (1 + 3) * 2))
+    assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
 
 
 def test_open3d_finds_the_same_surface():
@@ -210,8 +200,6 @@ def test_overlap_is_blended_by_confidence_where_that_is_the_weight():
     assert height(fused(far, near)) == pytest.approx(height(fused(near, far)), abs=1e-5)
     assert len(fused(near, wall(2.03, colour=0.0)).xyz) and not len(fused(wall(2.03, colour=0.0)).xyz)
     assert float(fused(near, far).sigma.median()) == pytest.approx(0.02, rel=0.05), "voxel / sqrt(sum of confidences)"
-    with pytest.raises(ValueError, match="weight: found 'score', expected variance or confidence"):
-        fuse_views(make_volume(0.02, channels=1), near, weight="score")
 
 
 def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
@@ -225,14 +213,6 @@ def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
     assert bool(found.all())
     known = apart.weight.sum(-1) > 0
     torch.testing.assert_close(together.distance[at][known], apart.distance[known], atol=0.02, rtol=0)
-
-
-def test_the_volume_that_was_fused_into_is_unchanged():
-    before = fuse_views(make_volume(0.02, channels=1), wall(2.0))
-    kept = before.map(torch.clone)
-    fuse_views(before, wall(2.02))
-    for name in ("key", "distance", "weight", "features"):
-        assert torch.equal(getattr(before, name), getattr(kept, name))
 
 
 def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
@@ -338,32 +318,37 @@ def test_no_answer_leaves_no_trace():
     assert extract_mesh(make_volume()).xyz.shape == extract_mesh(make_volume()).face.shape == (0, 3)
 
 
-def test_wrong_shapes_and_options_raise():
-    good, volume = wall(), make_volume(0.02, channels=1)
-    for wrong in (
-        good.replace(sigma=good.sigma[..., 1:]),
-        good.replace(features=good.features[0]),
-        good.replace(features=good.features.expand(-1, -1, -1, 2)),
-        good.replace(camera=Camera(good.camera.f[0], good.camera.c[0])),
-        good.replace(T_world_from_cam=se3.identity(2, good.depth)),
-    ):
-        with pytest.raises(ValueError, match=r"fuse_views"):
-            fuse_views(volume, wrong)
-    with pytest.raises(ValueError, match="source is 0"):
-        fuse_views(volume, good, source=Source.NONE)
-    with pytest.raises(ValueError, match="fuse_views"):
-        fuse_views(volume, good, source=torch.ones_like(good.depth[:, 1:]))
-    for options in ({"voxel": 0.0}, {"voxel": -1.0}, {"voxel": 0.02, "truncation": 0.01}):
-        with pytest.raises(ValueError, match="expected 0 < voxel <= truncation"):
-            make_volume(**options)
-    with pytest.raises(ValueError, match="min_weight is -1"):
-        extract_points(volume, min_weight=-1)
-    with pytest.raises(ValueError, match=r"splat_points"):
-        no_points(good.camera, 3, wrong=1)
+GOOD = wall()
 
 
-def test_a_mesh_without_scikit_image_names_the_extra(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda v: fuse_views(v, GOOD, source=Source.NONE), "source is 0"),
+        (lambda v: fuse_views(v, GOOD, source=torch.ones_like(GOOD.depth[:, 1:])), "fuse_views"),
+        (lambda v: fuse_views(v, GOOD, weight="score"), "weight: found 'score', expected variance or confidence"),
+        *(
+            (lambda _, o=o: make_volume(**o), "expected 0 < voxel <= truncation")
+            for o in ({"voxel": 0.0}, {"voxel": -1.0}, {"voxel": 0.02, "truncation": 0.01})
+        ),
+        (lambda v: extract_points(v, min_weight=-1), "min_weight is -1"),
+        (lambda v: extract_mesh(v, min_weight=-1), "min_weight is -1"),
+        (lambda _: no_points(GOOD.camera, 3, wrong=1), "splat_points"),
+        (lambda v: drop_unconfirmed(v, 0), "least is 0, expected at least 1"),
+        (
+            lambda _: recording.place_frames(Trajectory(None), []),
+            "walk has no trajectory of its own, expected poses=anch",
+        ),
+        (
+            lambda _: recording.place_frames(Trajectory(None), [], poses="gps"),
+            "found 'gps', expected one of device, anchored",
+        ),
+    ],
+)
+def test_wrong_options_and_sources_raise(call, words, monkeypatch):
+    with pytest.raises(ValueError, match=words):
+        call(make_volume(0.02, channels=1))
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(ImportError, match=r"pip install scikit-image"):
         extract_mesh(make_volume())
 
@@ -434,10 +419,6 @@ def test_device_poses_are_the_recordings_own_where_finite():
     )
     assert set(places.poses) == {0, 1, 4} and (places.n_fragments, places.n_unplaced) == (1, 1)
     assert torch.equal(places.poses[4].t, TRUE.t[4:5])
-    with pytest.raises(ValueError, match="walk has no trajectory of its own, expected poses=anchored"):
-        recording.place_frames(Trajectory(None), [])
-    with pytest.raises(ValueError, match="found 'gps', expected one of device, anchored"):
-        recording.place_frames(Trajectory(None), [], poses="gps")
 
 
 WIDTHS = ([(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)], [(0, 1), (1, 2)], [(0, 3), (6, 9)])
@@ -450,13 +431,6 @@ def test_links_of_another_width_join_all_frames(pairs):
     answers = [answered(i, j, se3.identity(1, TRUE.t)) for i, j in [*pairs, *links]]
     places = recording.place_frames(Trajectory(None), answers, poses="anchored")
     assert places.n_fragments == 1 and places.n_unplaced == 0
-
-
-def test_the_camera_knows_where_up_is():
-    turned = se3.exp(torch.tensor([[math.pi / 2, 0, 0, 0, 0, 0]]).double())
-    assert level.mean_camera_up([se3.identity(1, TRUE.t)]).tolist() == pytest.approx([0, -1, 0])
-    assert level.mean_camera_up([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
-    assert level.mean_camera_up([]).tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("own", [None, Camera(torch.tensor([[40.0, 38.0]]), torch.tensor([[17.0, 12.0]]))])
@@ -476,20 +450,15 @@ def test_a_frames_depth_wears_the_pictures_colours(own):
     assert float(error.median()) < 0.04
 
 
-def test_sparse_returns_become_discs():
+def test_sparse_returns_become_discs_and_coverage_counts_cells_and_islands():
     frame = walk(1)[0]
     few = torch.zeros_like(frame.depth)
     few[0, ::8, ::8] = frame.depth[0, ::8, ::8]
     one = recording.view_from_sensor(frame.replace(depth=few), frame.T_world_from_cam, radius=0.15)
     assert 4 * int((few > 0).sum()) < int((one.depth > 0).sum()) < 0.9 * few.numel()
-
-
-def test_coverage_counts_cells_and_islands():
-    xyz = torch.tensor(
-        [[0.05, 0.05, 0.05], [0.15, 0.15, 0.05], [0.95, 0.05, 0.05], [math.nan, 0, 0], [0.06, 0.06, 0.06]]
-    )
-    found = recording.measure_coverage(xyz, 0.1)
-    assert found == {"n_voxels": 3, "n_islands": 2, "largest_island": pytest.approx(2 / 3)}
+    xyz = torch.tensor([[0.05, 0.05, 0.05], [0.15, 0.15, 0.05], [0.95, 0.05, 0.05], [math.nan, 0, 0], [0.06] * 3])
+    counts = {"n_voxels": 3, "n_islands": 2, "largest_island": pytest.approx(2 / 3)}
+    assert recording.measure_coverage(xyz, 0.1) == counts
     assert recording.measure_coverage(xyz[3:4], 0.1) == {"n_voxels": 0, "n_islands": 0, "largest_island": None}
 
 
@@ -537,12 +506,6 @@ def test_of_two_grids_each_is_what_it_is_alone_and_frames_are_read_once(walked, 
     for one, other in zip(alone, both, strict=True):
         for name in ("key", "distance", "weight", "features"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
-
-
-def test_memory_is_that_of_the_blocks(room):
-    _, volume, _ = room
-    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 4 * 4 + 1 + (1 + 3) * 2))
-    assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
 
 
 # --------------------------------------------------------------------------------------------------------- swept maps
@@ -631,8 +594,6 @@ def test_a_surface_that_one_map_alone_has_is_kept_where_others_speak():
     both = fuse_views(volume, view(frame, sigma=0.5 * VOXEL), source=Source.RECOVERED)
     assert len(extract_points(drop_unconfirmed(both)).xyz) == len(extract_points(both).xyz)
     assert int(fuse_views(volume, view(frame), source=Source.SWEPT).n_swept.max()) == 2
-    with pytest.raises(ValueError, match="least is 0, expected at least 1"):
-        drop_unconfirmed(volume, 0)
 
 
 def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
@@ -649,29 +610,6 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
         torch.testing.assert_close(depth, torch.where(there, frame.depth, 0.0), rtol=1e-3, atol=0)
         assert torch.equal(score, 0.5 * there) and torch.equal(source, Source.SWEPT * there.float())
         assert float((sigma - 0.02 * there).abs().max()) < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("yes", "dense: found 'yes', expected true, false or options among source_views, planes"),
-        ({"planse": 3}, "dense: found 'planse', expected some of source_views, planes"),
-        ({"planes": 3.5}, r"dense\.planes: found 3\.5, expected a whole number"),
-        ({"min_correlation": "high"}, r"dense\.min_correlation: found 'high', expected a number"),
-        ({"size": True}, r"dense\.size: found True, expected a whole number"),
-    ],
-)
-def test_what_no_sweep_can_be_asked_for_is_refused(given, words):
-    with pytest.raises(ValueError, match=words):
-        sweeps.DenseSweep.from_options(given)
-
-
-def test_a_sweep_is_asked_for_by_true_or_by_options():
-    assert sweeps.DenseSweep.from_options(False) is None is sweeps.DenseSweep.from_options(None)
-    standard = dense.dense_options(True)
-    assert standard is not None and sweeps.DenseSweep.from_options(True).options == standard
-    asked = {"min_correlation": 1, "size": 320}
-    assert sweeps.DenseSweep.from_options(asked).options == standard | asked
 
 
 @pytest.mark.slow
@@ -702,15 +640,3 @@ def far_of(room, k, xyz):
     v, u = (depth > 2.2).nonzero()[::7].T
     true = cameras.unproject(frame.camera, torch.stack((u, v), -1)[None].float(), depth[None, v, u].float())
     return torch.cdist(se3.apply(frame.T_world_from_cam, true.double())[0], xyz.double()).amin(1)
-
-
-def test_up_is_the_formats_axis_else_the_floors():
-    """A floor that lies askew of what the cameras hold upright; a format that knows better is believed."""
-    g = torch.Generator().manual_seed(0)
-    ground = torch.rand(800, 3, generator=g).double() * torch.tensor([4.0, 0.01, 4.0])
-    wall = torch.rand(300, 3, generator=g).double() * torch.tensor([0.01, 3.0, 4.0])
-    askew = se3.exp(torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)).R[0]
-    found = level._fit_floor_normal(torch.cat((ground, wall)) @ askew.T, torch.tensor([0.0, -1.0, 0.0]).double(), 0.02)
-    assert (found - askew @ torch.tensor([0.0, -1.0, 0.0]).double()).norm() < 0.02
-    up = (askew @ torch.tensor([0.0, -1.0, 0.0]).double()).tolist()
-    assert (se3.turn_between(up) @ torch.tensor(up, dtype=torch.float64) - torch.tensor([0.0, -1.0, 0.0])).norm() < 1e-9

@@ -15,7 +15,6 @@ from dhtorch.integrate.level import (
     _UP_BY_FORMAT,
     _fit_floor_normal,
     _fit_upright_direction,
-    _is_in_own_world,
     _spiral_directions,
     estimate_up,
     mean_camera_up,
@@ -33,11 +32,12 @@ def level_floor():
 
 
 def test_a_floor_is_found():
-    up = torch.tensor([0.1, -1.0, 0.1], dtype=torch.float64)
-    found = _fit_floor_normal(level_floor(), up / up.norm(), 0.02)
-    tilt = (found - torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)).abs().max()
-    assert tilt < 0.02 / 4, "the wall's foot lies in the slab of 2 cm that is fitted, 4 m wide"
-    assert _fit_floor_normal(level_floor()[:50], up / up.norm(), 0.02) is None, "of few points none is believed"
+    down = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    askew = se3.exp(torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)).R[0]
+    for turn, guess in ((torch.eye(3).double(), down + 0.1), (askew, down)):  # of what the cameras hold upright
+        axis = _fit_floor_normal(level_floor() @ turn.T, guess / guess.norm(), 0.02)
+        assert (axis - turn @ down).abs().max() < 0.02 / 4, "the wall's foot lies in the slab of 2 cm, 4 m wide"
+    assert _fit_floor_normal(level_floor()[:50], down, 0.02) is None, "of few points none is believed"
 
 
 def test_a_plane_of_less_than_a_tenth_of_the_points_is_no_floor():
@@ -120,9 +120,14 @@ def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():
 def test_a_map_is_in_the_recordings_world_if_a_frame_of_it_is_there():
     R = se3.exp(torch.tensor([[0.1 * k, 0.0, 0.0, 0.0, 0.0, 0.0] for k in range(4)], dtype=torch.float64)).R
     poses = Pose(R[1:], torch.zeros(3, 3).double())
-    recording = Recording("a", "tum", load=lambda _i: None, number=torch.arange(3), poses=poses)  # type: ignore[arg-type]
-    assert _is_in_own_world(recording, [poses[2:3]]) and not _is_in_own_world(recording, [])
-    assert not _is_in_own_world(recording, [Pose(R[:1], poses.t[:1])])
+    recording = Recording("a", "stray", load=lambda _i: None, number=torch.arange(3), poses=poses)  # type: ignore[arg-type]
+    none = torch.zeros(0, 3)
+    assert estimate_up(recording, [poses[2:3]], none, 0.02) == [0.0, 1.0, 0.0]
+    for given in ([], [Pose(R[:1], poses.t[:1])]):
+        assert estimate_up(recording, given, none, 0.02) == mean_camera_up(given).tolist()
+    turned = se3.exp(torch.tensor([[torch.pi / 2, 0, 0, 0, 0, 0]]).double())
+    assert mean_camera_up([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
+    assert mean_camera_up([]).tolist() == [0, -1, 0]
 
 
 def test_directions_are_spread_evenly():

@@ -86,13 +86,6 @@ def test_cameras_that_look_down_or_at_one_another_still_have_a_level_direction()
     np.testing.assert_allclose(T.R[0, :, 2] * math.sqrt(1 + 0.25**2 + 0.45**2), [-0.25, 0.45, 1], atol=1e-12)
 
 
-def test_without_points_the_view_point_is_two_metres_behind_what_is_ahead():
-    none = wall().replace(xyz=torch.zeros(0, 3))
-    (camera,) = cameras_at((1.0, 2.0, 3.0))
-    T = picture._viewpoint(none, [camera], UP)
-    np.testing.assert_allclose(T.t[0], np.array([1, 2, 4.0]) - 2.2 * T.R[0, :, 2].numpy(), atol=1e-9)
-
-
 # -------------------------------------------------------------------------------------------------------------- camera
 
 
@@ -109,11 +102,6 @@ def test_the_points_fill_nine_tenths_of_the_narrower_side(hw):
     for k, size in enumerate((hw[1], hw[0])):
         ends = focal * np.array([low[k], high[k]]) + float(camera.c[0, k])
         assert ends.mean() == pytest.approx(size / 2), "in the middle"
-
-
-def test_a_camera_without_points_looks_straight_ahead():
-    camera = picture._fit_camera(torch.zeros(0, 3), (600, 800))
-    assert camera.f.tolist() == [[800, 800]] and camera.c.tolist() == [[400, 300]]
 
 
 # ------------------------------------------------------------------------------------------------------------ pictures
@@ -173,9 +161,13 @@ def test_the_path_and_the_length_of_a_metre_are_those_of_the_drawing(drawn):
 
 
 def test_a_map_without_points_is_white_and_has_no_scale(drawn):
-    none = wall().map(lambda x: x[:0])
-    kept = drawn(none, cameras_at((0.0, 0.0, 0.0)), hw=(30, 40))
+    none, (camera,) = wall().map(lambda x: x[:0]), cameras_at((1.0, 2.0, 3.0))
+    kept = drawn(none, [camera], hw=(30, 40))
     assert kept.metre is None and all((each == 1).all() for each in kept.pictures.values())
+    T = picture._viewpoint(none, [camera], UP)
+    np.testing.assert_allclose(T.t[0], np.array([1, 2, 4.0]) - 2.2 * T.R[0, :, 2].numpy(), atol=1e-9)
+    ahead = picture._fit_camera(torch.zeros(0, 3), (600, 800))
+    assert ahead.f.tolist() == [[800, 800]] and ahead.c.tolist() == [[400, 300]]
 
 
 # -------------------------------------------------------------------------------------------------------------- figure
