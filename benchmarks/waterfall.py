@@ -26,7 +26,7 @@ import loader
 import pair as pairs
 import torch
 
-from dhtorch.cli import complete, completed_folder, process_capture, recover_pictures
+from dhtorch.cli import complete, completed_folder, process_capture
 from dhtorch.cli import run as command
 from dhtorch.data.recording import Recording
 from dhtorch.export import encode_png
@@ -56,8 +56,8 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "misaligned depth": [(misalignment, "_reject")],
     "sweep": [(dense, "sweep_views")],
     "filter and fill": [(dense, "filter_sweep")],
-    "figures": [(complete, "draw_completed"), (recover_pictures, "write_overview")],
-    "video": [(recover_pictures, "write_moving_preview")],
+    "figures": [(complete, "draw_completed"), (process_capture, "write_overview")],
+    "video": [(process_capture, "write_moving_preview")],
     "PNG files": [(sys.modules[encode_png.__module__], "encode_png")],
     "fuse the map": [(from_maps, "_fuse_sources")],
     "extract the surface": [(from_maps, "extract_points"), (from_maps, "extract_mesh")],

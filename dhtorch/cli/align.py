@@ -21,14 +21,13 @@ from dhtorch.alignment import align
 from dhtorch.alignment.map_family import MAP_FAMILIES
 from dhtorch.cli import complete
 from dhtorch.cli import completed_folder as completed
-from dhtorch.cli.completed_folder import CompletionTask
-from dhtorch.cli.layouts import select_layout
+from dhtorch.cli.completed_folder import CompletionTask, select_layout
+from dhtorch.cli.option_checks import validate_choices
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.data import depth_maps
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import upcast_intrinsics
 from dhtorch.pipeline.spec import Trace
@@ -98,7 +97,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data, or an output folder with other files.
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
-    limits = _check_options(settings)
+    validate_choices(settings, {"kind": align.ALIGNMENT_KINDS})
+    limits = parse_limits(settings["fail_on"], _ALIGNMENT_LIMITS)
+    if settings["kind"] != "metric" and (wrong := {"scale", "change"} & set(limits)):
+        raise ValueError(
+            f"fail_on: found {', '.join(sorted(wrong))} with kind={settings['kind']}, expected kind=metric"
+        )
     scenes = scenes_of(parts["data"])
     if len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
@@ -106,33 +110,27 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
     task = _make_alignment_task(scene, maps, parts["method"], settings, out)
     with completed.open_task_folder(task, ("align.json", "align.html")):
-        return _align_task(task, maps, settings, limits, progress)
-
-
-def _align_task(
-    task: CompletionTask, maps: DepthMaps, settings: Mapping[str, Any], limits: Mapping[str, float], progress: Progress
-) -> int:
-    """Align the missing maps of a task, write and print the summary; returns the exit code."""
-    scene, out = task.scene, task.folder
-    n_untouched = sum(task.name(i) in task.done for i in task.frames)
-    todo = [i for i in task.frames if task.name(i) not in task.done]
-    with complete.close_on_exit(task):
-        for i in progress(todo, f"{scene.name}: frames", len(todo)):
-            complete.write_frame(task, i, *_align_frame(task, maps, i))
-    rows = [task.done[task.name(i)] for i in task.frames]
-    summary = _summarise_recording(rows)
-    exceeded = list_exceeded_limits(summary, limits, _ALIGNMENT_LIMITS)
-    content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": exceeded}
-    keep = ("frame", "aligned", "views")
-    content |= {"maps": maps.report, "whole": summary, "frames": [{k: row[k] for k in keep} for row in rows]}
-    storage.write_json(out / "align.json", storage.to_strict_json(content))
-    lines = [
-        *_format_summary(scene.name, settings["kind"], summary, n_untouched),
-        *(f"  {note}" for note in [*(maps.doubts if settings["kind"] == "metric" else []), *maps.notes]),
-    ]
-    _write_page(task, maps, lines, exceeded)
-    print("\n".join([*lines, *(f"  exceeded: {limit_line}" for limit_line in exceeded), "wrote", f"  {out}"]))
-    return int(bool(exceeded))
+        # Align the missing maps of a task, write and print the summary; returns the exit code
+        scene, out = task.scene, task.folder
+        n_untouched = sum(task.name(i) in task.done for i in task.frames)
+        todo = [i for i in task.frames if task.name(i) not in task.done]
+        with complete.close_on_exit(task):
+            for i in progress(todo, f"{scene.name}: frames", len(todo)):
+                complete.write_frame(task, i, *_align_frame(task, maps, i))
+        rows = [task.done[task.name(i)] for i in task.frames]
+        summary = _summarise_recording(rows)
+        exceeded = list_exceeded_limits(summary, limits, _ALIGNMENT_LIMITS)
+        content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": exceeded}
+        keep = ("frame", "aligned", "views")
+        content |= {"maps": maps.report, "whole": summary, "frames": [{k: row[k] for k in keep} for row in rows]}
+        storage.write_json(out / "align.json", storage.to_strict_json(content))
+        lines = [
+            *_format_summary(scene.name, settings["kind"], summary, n_untouched),
+            *(f"  {note}" for note in [*(maps.doubts if settings["kind"] == "metric" else []), *maps.notes]),
+        ]
+        _write_page(task, maps, lines, exceeded)
+        print("\n".join([*lines, *(f"  exceeded: {limit_line}" for limit_line in exceeded), "wrote", f"  {out}"]))
+        return int(bool(exceeded))
 
 
 # -------------------------------------------------------------------------------------------------------------- frames
@@ -171,14 +169,14 @@ def _align_frame(task: CompletionTask, maps: DepthMaps, i: int) -> tuple[Frame, 
     """Align the map of frame ``i`` -> the frame, its depth map (CPU), and a row with the views and the alignment."""
     settings, depth_map = task.settings, maps[i]
     assert depth_map is not None  # only frames with a map are in the task
-    frame = _load_frame(task, i)
+    frame = task.load(i)
     x = torch.where(depth_map > 0, depth_map, torch.nan).to(frame.camera.f)  # 0 in a file is no value, for every kind
     trace: Trace = {}
     views: list[int] = []
     with torch.no_grad():
         if len(task.recording) > 1:
             offered = candidate_frames(task.recording, i, settings["steps"], settings["past"])
-            source_views = stack([_load_frame(task, k) for k in offered])
+            source_views = stack([task.load(k) for k in offered])
             method = with_view_selection(task.method)
             estimate = method(frame, source_views, seed=settings["seed"], hint=task.scene.hint, trace=trace)
             references, views = [trace["samples"], estimate], [int(task.recording.number[k]) for k in offered]
@@ -199,16 +197,14 @@ def _align_frame(task: CompletionTask, maps: DepthMaps, i: int) -> tuple[Frame, 
     return frame, aligned, {"views": views, "aligned": row}
 
 
-def _load_frame(task: CompletionTask, i: int) -> Frame:
-    s = task.settings
-    return range_split(task.recording[i].to(getattr(torch, s["dtype"])).to(s["device"]), s["cutoff"])
-
-
 def _summarise_frame(x: Tensor, aligned: DepthMap, selection: align.ModelSelection) -> Row:
     """Statistics of one alignment: model and its probability, scale, relative change, sigma / depth, gaps."""
     keep, has_value = aligned.keep, x > 0
     best = int(selection.model)
-    row: Row = {"model": None if best < 0 else selection.names[best], "no_answer": 1 - _masked_share(keep, has_value)}
+    row: Row = {
+        "model": None if best < 0 else selection.names[best],
+        "no_answer": 1 - (int((keep & has_value).sum()) / max(int(has_value.sum()), 1)),
+    }
     row["family"] = None if selection.family is None else MAP_FAMILIES[int(selection.family)]
     row["probability"] = None if best < 0 else float(selection.weight[0, best])
     likeliest = int(selection.weight[0].argmax())
@@ -219,10 +215,6 @@ def _summarise_frame(x: Tensor, aligned: DepthMap, selection: align.ModelSelecti
     ratio = (aligned.depth / x)[keep].double()
     sigma = (aligned.sigma / aligned.depth)[keep].double().median()
     return row | {"scale": float(ratio.median()), "change": float((ratio - 1).abs().median()), "sigma": float(sigma)}
-
-
-def _masked_share(part: Tensor, whole: Tensor) -> float:
-    return int((part & whole).sum()) / max(int(whole.sum()), 1)
 
 
 # ------------------------------------------------------------------------------------------------------------- summary
@@ -319,21 +311,3 @@ def _render_frame(task: CompletionTask, maps: DepthMaps, i: int) -> bytes:
     aligned, _ = completed.read_completed_maps(task, i)
     draw_aligned(out, task.recording[i].image[0], depth_map, **aligned, title=f"{task.scene.name} {task.name(i)}")
     return out.getvalue()
-
-
-def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
-    """Validate the options early; returns the limits of ``fail_on``."""
-    for name, low in (("every", 1), ("max_frames", 1), ("pictures", 0)):
-        value = settings[name]
-        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not is_whole and not (name == "max_frames" and value is None):
-            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
-    for name, choices in (("dtype", ("float32", "float64")), ("kind", align.ALIGNMENT_KINDS)):
-        if settings[name] not in choices:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
-    limits = parse_limits(settings["fail_on"], _ALIGNMENT_LIMITS)
-    if settings["kind"] != "metric" and (wrong := {"scale", "change"} & set(limits)):
-        raise ValueError(
-            f"fail_on: found {', '.join(sorted(wrong))} with kind={settings['kind']}, expected kind=metric"
-        )
-    return limits

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,14 +20,13 @@ import torch.nn.functional as F
 from dhtorch import export
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import recover_page
-from dhtorch.cli.completed_folder import EXTRA_FILES, CompletionTask, Row
-from dhtorch.cli.layouts import FRAME_LAYOUTS, has_varying_camera, select_layout, stray_confidence
+from dhtorch.cli.completed_folder import FRAME_LAYOUTS, STRAY_CONFIDENCE, CompletionTask, Row, select_layout
+from dhtorch.cli.option_checks import validate_choices
 from dhtorch.codes import Gate, Source, is_estimated, names, words
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
@@ -44,30 +42,16 @@ from dhtorch.viz.plots import draw_completed
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
-#: Name of the calibration included in the package.
-_DEFAULT_CALIBRATION_NAME = "fused"
-
 #: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")
 #: Further ones, which enter it only where they are set.
 _SET_KEY_OPTIONS = ("budget", "sensor")
-
-#: Numeric option → (low, high): valid in low < value <= high.
-_OPTION_RANGES = {
-    "unit": (1e-6, 0.1),
-    "cutoff": (0, math.inf),
-    "min_correlation": (-1, 1),
-    "max_sigma_rel": (0, math.inf),
-}
 
 #: Pixels per inch of the figures of ``previews/``, about 1000 px wide. Source: chosen for an eighth of a figure's size.
 _PREVIEW_DPI = 100.0
 
 #: Sources whose number of pixels is in every meta file; that of others is left out where it is 0.
 _COUNTED_SOURCES = ("none", "sensor", "swept")
-
-#: Values of ``figures`` and ``points``: no frame, the first one, or all frames.
-_EXTRAS_CHOICES = (False, True, "all")
 
 #: Modules that determine the result, beside those that the settings name.
 _CODE_ROOTS = (
@@ -93,7 +77,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError, ImportError: bad options or data, or an output folder with other files.
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
-    _check_options(settings)
+    validate_choices(settings, {"format": ("auto", *FRAME_LAYOUTS)})
+    if settings["unit"] is not None and not 1e-6 < settings["unit"] <= 0.1:
+        raise ValueError(f"unit: found {settings['unit']!r}, expected a number above 1e-06, at most 0.1")
     scenes = scenes_of(parts["data"])
     out = Path(str(settings["out"])).expanduser()
     with open_output_folder(out, "out") if len(scenes) > 1 else contextlib.nullcontext():
@@ -117,8 +103,32 @@ def _complete_scenes(
         task = make_completion_task(scene, folder, method, settings, digests[scene.root])
         with completed.open_task_folder(task):
             n_untouched = sum(task.name(i) in task.done for i in task.frames)
-            _complete_missing(task, progress)
-        summaries[folder] = _format_summary(task, n_untouched)
+            # The folder is a readable recording afterwards, unless the process is killed
+            todo = [i for i in task.frames if task.missing(i)]
+            with close_on_exit(task):
+                for i in progress(todo, f"{scene.name}: frames", len(todo)):
+                    complete_frame(task, i)
+        # Printed summary of one scene
+        rows = [task.done[task.name(i)] for i in task.frames]
+        stats = recover_page.measure_recovery(task, task.frames)
+        reasons = dict(stats.reasons)
+        unfit = reasons.pop("unfit")
+        why = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in reasons.items())
+        counts = {kind: f"{words(kind)} {fraction:.1%}" for kind, fraction in stats.fractions.items()}
+        counts["recovered"] += f" (median sigma {stats.error:.1%} of the depth)" if stats.error is not None else ""
+        layout, (h, w) = task.layout, rows[0]["hw"]
+        untouched = f" ({n_untouched} left untouched)" if n_untouched else ""
+        shown = f"{', '.join(counts.values())}{f' ({why})' if why else ''}"
+        lines = [
+            f"{scene.name}: {format_count(len(rows), 'frame')}{untouched} of {w}x{h}: {shown}",
+            f"  depth in steps of {1e3 * layout.unit:g} mm, up to {layout.reach:.1f} m"
+            + (f": {unfit:.2%} of the pixels are beyond it and left empty (see unit=, arrays=true)" if unfit else ""),
+        ]
+        if layout.name == "png" != task.settings["format"]:
+            lines.append("  maps only, not a recording: some frames have no pose")
+        if layout.pictures and any((r["K"], r["distortion"]) != (rows[0]["K"], rows[0]["distortion"]) for r in rows):
+            lines.append("  the intrinsics change: K.txt has those of the first frame, meta/ those of every frame")
+        summaries[folder] = "\n".join(lines)
     return summaries
 
 
@@ -150,7 +160,7 @@ def make_completion_task(
             digest,
             keyed=(*_KEY_OPTIONS, *(name for name in _SET_KEY_OPTIONS if settings.get(name))),
             roots=_CODE_ROOTS,
-            calibration=_DEFAULT_CALIBRATION_NAME,
+            calibration="fused",
         ),
     )
 
@@ -158,168 +168,10 @@ def make_completion_task(
 # ------------------------------------------------------------------------------------------------------------- frames
 
 
-def _complete_missing(task: CompletionTask, progress: Progress) -> None:
-    """Write the missing frames one by one; the folder is a readable recording unless the process is killed."""
-    todo = [i for i in task.frames if task.missing(i)]
-    with close_on_exit(task):
-        for i in progress(todo, f"{task.scene.name}: frames", len(todo)):
-            complete_frame(task, i)
-
-
 def complete_frame(task: CompletionTask, i: int) -> None:
-    """Write the missing files of frame ``i``."""
+    """Write the missing files of frame ``i``; figures and points are made from its written maps."""
     if task.name(i) not in task.done:
         write_frame(task, i, *_compute_map(task, i))
-    _write_extras(task, i)
-
-
-@contextlib.contextmanager
-def close_on_exit(task: CompletionTask) -> Iterator[None]:
-    """Context in which frames are written: on exit, also by an exception, the folder is closed as a recording.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C; the message gives the number of complete frames.
-    """
-    try:
-        try:
-            yield
-        finally:
-            _close_folder(task)
-    except KeyboardInterrupt:
-        n = sum(task.name(i) in task.done for i in task.frames)
-        stay = f"{n} of {format_count(len(task.frames), 'frame')} in {task.folder} are complete and kept"
-        raise KeyboardInterrupt(f"{stay}; run the same command again for the rest") from None
-
-
-def _close_folder(task: CompletionTask) -> None:
-    """Register the complete frames and write the files that make the folder a recording."""
-    task.done.update(completed.read_complete_frames(task))
-    complete = [i for i in range(len(task.recording)) if task.name(i) in task.done]
-    if complete:
-        task.layout.close(task.folder, task.recording, complete, [task.done[task.name(i)] for i in complete])
-
-
-def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
-    """Complete frame ``i`` -> the reference frame, its depth map (CPU), and a row with the selected views."""
-    settings, offered = task.settings, task.offers.get(i, ())
-    reference = _load_frame(task, i)
-    if not offered:
-        completed_map = dense.sensor_depth_map(reference, method=task.method, size=settings["size"])
-        return reference, completed_map.to("cpu"), {"views": [], "n_offered": 0}
-    source_views = stack([_load_frame(task, k) for k in offered])
-    options: dict[str, Any] = {k: settings[k] for k in (*dense.DENSE_OPTIONS, "seed")}
-    options |= {
-        "method": with_view_selection(task.method),
-        "calibration": default_calibration(),
-        "hint": task.scene.hint,
-    }
-    trace: Trace = {}
-    with torch.no_grad():
-        completed_map = complete_depth(reference, source_views, **options, trace=trace)
-    choice = report_selection(i, offered, trace)
-    views = [int(task.recording.number[k]) for k in choice.views]
-    row: Row = {"views": views, **choice.row()["why"]}
-    if task.recording.poses is None:
-        row["motions"] = _solved_motions(views, trace)
-    return reference, completed_map.to("cpu"), row
-
-
-def _solved_motions(views: Sequence[int], trace: Trace) -> Row:
-    """Frame number of a source view → its solved pose relative to the reference view, a matrix (4, 4)."""
-    fits = [each["fit"] for each in trace.get("views", ())] or [trace["fit"]]
-    solved = [(number, fit) for number, fit in zip(views, fits, strict=False) if bool(fit.ok[0])]
-    return {str(number): se3.to_matrix(fit.T_1_from_0.to("cpu"))[0] for number, fit in solved}
-
-
-def _load_frame(task: CompletionTask, i: int) -> Frame:
-    """Frame ``i`` in the chosen dtype and device, returns beyond the cutoff hidden."""
-    settings = task.settings
-    frame = task.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
-    return range_split(frame, settings["cutoff"])
-
-
-def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: DepthMap, views_row: Row) -> None:
-    """Write the files of one frame; the meta file, which marks it complete, comes last."""
-    name, layout, depth_map = task.name(i), task.layout, depth_maps[0]
-    steps = export.quantise_depth(depth_map.depth, depth_map.sigma, depth_map.source, layout.unit)
-    pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
-    if layout.pictures:
-        pictures[layout.pictures] = resize_picture(reference, steps.depth.shape)
-    if layout.confidence:
-        pictures["confidence"] = stray_confidence(steps.source)
-    shares: Row = {}
-    if layout.budget:
-        pictures["budget"], shares["sigma_shares"] = _summarise_budget(depth_map)
-    if not (shared_file := task.folder / "complete.json").is_file():
-        storage.write_json(shared_file, task.shared)
-    for kind, pixels in pictures.items():
-        storage.replace_file(layout.file(task.folder, kind, name), export.encode_png(pixels))
-    if layout.arrays:
-        storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(depth_map))
-    row = storage.to_strict_json(
-        _describe_frame(task, i, reference, steps) | views_row | _count_pixels(steps, depth_map) | shares
-    )
-    storage.write_json(layout.file(task.folder, "meta", name), row)
-    task.done[name] = row
-
-
-def _describe_frame(task: CompletionTask, i: int, reference: Frame, steps: export.QuantisedDepth) -> Row:
-    """Metadata of one frame: units, camera, pose, time, size."""
-    camera = cameras.resize(reference.camera, reference.hw, steps.depth.shape).to("cpu")
-    poses = task.recording.poses
-    shared_keys = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
-    return {
-        **{k: task.shared[k] for k in shared_keys},
-        "cutoff_m": task.settings["cutoff"],
-        "frame": int(task.recording.number[i]),
-        "time": None if reference.time is None else float(reference.time[0]),
-        "hw": list(steps.depth.shape),
-        "K": cameras.to_matrix(camera)[0],
-        "distortion": None if camera.distortion is None else camera.distortion[0],
-        "T_world_from_cam": None if poses is None else se3.to_matrix(poses[i : i + 1])[0],
-    }
-
-
-def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
-    """Pixel counts by source, and fractions of all pixels without an answer, by reason."""
-    counts = {name.lower(): int((steps.source == code).sum()) for code, name in names(Source).items()}
-    pixels = {name: n for name, n in counts.items() if n or name in _COUNTED_SOURCES}
-    gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
-    no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
-    return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
-
-
-def _summarise_budget(depth_map: DepthMap) -> tuple[np.ndarray, Row]:
-    """Map (h, w) -> the largest cause of every pixel's sigma as uint8, codes.Cause, and the mean share of each cause in
-    sigma² over the estimated pixels."""
-    budget = depth_map.budget
-    shares = budget.shares(depth_map.keep & is_estimated(depth_map.source))
-    return budget.dominating.to(torch.uint8).numpy(), shares
-
-
-def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
-    """Frame image -> (h, w, 3) or (h, w) uint8 at the map's size, by area averaging."""
-    image = frame.image[0].cpu()
-    if image.is_floating_point():
-        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
-    if image.shape[-2:] != hw:
-        image = F.interpolate(image[None].float(), hw, mode="area")[0].round().to(torch.uint8)
-    return image[0].numpy() if len(image) == 1 else image.permute(1, 2, 0).numpy()
-
-
-def _encode_arrays(depth_map: DepthMap) -> bytes:
-    """Depth, sigma, score, source and gate of a map, unquantised, as NPZ bytes."""
-    out = io.BytesIO()
-    codes = {k: getattr(depth_map, k).to(torch.uint8).numpy() for k in ("source", "gate")}
-    np.savez_compressed(out, **{k: getattr(depth_map, k).numpy() for k in ("depth", "sigma", "score")}, **codes)
-    return out.getvalue()
-
-
-# ------------------------------------------------------------------------------------------------- figures and points
-
-
-def _write_extras(task: CompletionTask, i: int) -> None:
-    """Write the missing figure and point files of a frame, from its written maps."""
     missing = [path for path in task.extras(i) if not is_whole(path)]
     if not missing:
         return
@@ -334,6 +186,121 @@ def _write_extras(task: CompletionTask, i: int) -> None:
             storage.replace_file(path, _render_completed(task, i, small, maps, source, dpi=_PREVIEW_DPI, kind="jpg"))
         else:
             _write_points(path, frame, picture, **maps, source=source)
+
+
+@contextlib.contextmanager
+def close_on_exit(task: CompletionTask) -> Iterator[None]:
+    """Context in which frames are written: on exit, also by an exception, the folder is closed as a recording.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; the message gives the number of complete frames.
+    """
+    try:
+        try:
+            yield
+        finally:
+            # Register the complete frames and write the files that make the folder a recording
+            task.done.update(completed.read_complete_frames(task))
+            complete = [i for i in range(len(task.recording)) if task.name(i) in task.done]
+            if complete:
+                task.layout.close(task.folder, task.recording, complete, [task.done[task.name(i)] for i in complete])
+    except KeyboardInterrupt:
+        n = sum(task.name(i) in task.done for i in task.frames)
+        stay = f"{n} of {format_count(len(task.frames), 'frame')} in {task.folder} are complete and kept"
+        raise KeyboardInterrupt(f"{stay}; run the same command again for the rest") from None
+
+
+def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
+    """Complete frame ``i`` -> the reference frame, its depth map (CPU), and a row with the selected views."""
+    settings, offered = task.settings, task.offers.get(i, ())
+    reference = task.load(i)
+    if not offered:
+        completed_map = dense.sensor_depth_map(reference, method=task.method, size=settings["size"])
+        return reference, completed_map.to("cpu"), {"views": [], "n_offered": 0}
+    source_views = stack([task.load(k) for k in offered])
+    options: dict[str, Any] = {k: settings[k] for k in (*dense.DENSE_OPTIONS, "seed")}
+    options |= {
+        "method": with_view_selection(task.method),
+        "calibration": default_calibration(),
+        "hint": task.scene.hint,
+    }
+    trace: Trace = {}
+    with torch.no_grad():
+        completed_map = complete_depth(reference, source_views, **options, trace=trace)
+    choice = report_selection(i, offered, trace)
+    views = [int(task.recording.number[k]) for k in choice.views]
+    row: Row = {"views": views, **choice.row()["why"]}
+    if task.recording.poses is None:
+        fits = [each["fit"] for each in trace.get("views", ())] or [trace["fit"]]
+        solved = [(number, fit) for number, fit in zip(views, fits, strict=False) if bool(fit.ok[0])]
+        row["motions"] = {str(number): se3.to_matrix(fit.T_1_from_0.to("cpu"))[0] for number, fit in solved}
+    return reference, completed_map.to("cpu"), row
+
+
+def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: DepthMap, views_row: Row) -> None:
+    """Write the files of one frame; the meta file, which marks it complete, comes last."""
+    name, layout, depth_map = task.name(i), task.layout, depth_maps[0]
+    steps = export.quantise_depth(depth_map.depth, depth_map.sigma, depth_map.source, layout.unit)
+    pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
+    if layout.pictures:
+        pictures[layout.pictures] = resize_picture(reference, steps.depth.shape)
+    if layout.confidence:
+        table = np.zeros(max(STRAY_CONFIDENCE) + 1, np.uint8)
+        table[list(STRAY_CONFIDENCE)] = list(STRAY_CONFIDENCE.values())
+        pictures["confidence"] = table[steps.source]
+    shares: Row = {}
+    if layout.budget:
+        # The largest cause of every pixel's sigma; of estimated pixels the mean fraction of each cause in sigma²
+        pictures["budget"] = depth_map.budget.dominating.to(torch.uint8).numpy()
+        shares["sigma_shares"] = depth_map.budget.shares(depth_map.keep & is_estimated(depth_map.source))
+    if not (shared_file := task.folder / "complete.json").is_file():
+        storage.write_json(shared_file, task.shared)
+    for kind, pixels in pictures.items():
+        storage.replace_file(layout.file(task.folder, kind, name), export.encode_png(pixels))
+    if layout.arrays:
+        out = io.BytesIO()  # unquantised
+        codes = {k: getattr(depth_map, k).to(torch.uint8).numpy() for k in ("source", "gate")}
+        np.savez_compressed(out, **{k: getattr(depth_map, k).numpy() for k in ("depth", "sigma", "score")}, **codes)
+        storage.replace_file(layout.file(task.folder, "arrays", name), out.getvalue())
+    # Pixel counts by source, and fractions of all pixels without an answer, by reason
+    counts = {name.lower(): int((steps.source == code).sum()) for code, name in names(Source).items()}
+    gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
+    no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
+    # Metadata of one frame: units, camera, pose, time, size
+    camera = cameras.resize(reference.camera, reference.hw, steps.depth.shape).to("cpu")
+    poses = task.recording.poses
+    shared_keys = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
+    row = storage.to_strict_json(
+        {
+            **{k: task.shared[k] for k in shared_keys},
+            "cutoff_m": task.settings["cutoff"],
+            "frame": int(task.recording.number[i]),
+            "time": None if reference.time is None else float(reference.time[0]),
+            "hw": list(steps.depth.shape),
+            "K": cameras.to_matrix(camera)[0],
+            "distortion": None if camera.distortion is None else camera.distortion[0],
+            "T_world_from_cam": None if poses is None else se3.to_matrix(poses[i : i + 1])[0],
+        }
+        | views_row
+        | {"pixels": {name: n for name, n in counts.items() if n or name in _COUNTED_SOURCES}}
+        | {"no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
+        | shares
+    )
+    storage.write_json(layout.file(task.folder, "meta", name), row)
+    task.done[name] = row
+
+
+def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
+    """Frame image -> (h, w, 3) or (h, w) uint8 at the map's size, by area averaging."""
+    image = frame.image[0].cpu()
+    if image.is_floating_point():
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    if image.shape[-2:] != hw:
+        image = F.interpolate(image[None].float(), hw, mode="area")[0].round().to(torch.uint8)
+    return image[0].numpy() if len(image) == 1 else image.permute(1, 2, 0).numpy()
+
+
+# ------------------------------------------------------------------------------------------------- figures and points
 
 
 def _render_completed(
@@ -358,53 +325,3 @@ def _write_points(
         export.write_ply(path, xyz, rgb, sigma=sigma.reshape(-1), source=source.reshape(-1))
     else:
         export.write_glb(path, [export.Shape("view", xyz, rgb, face=export.mesh_depth_map(depth))])
-
-
-def _format_summary(task: CompletionTask, n_untouched: int) -> str:
-    """Printed summary of one scene."""
-    rows = [task.done[task.name(i)] for i in task.frames]
-    stats = recover_page.measure_recovery(task, task.frames)
-    reasons = dict(stats.reasons)
-    unfit = reasons.pop("unfit")
-    why = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in reasons.items())
-    counts = {kind: f"{words(kind)} {fraction:.1%}" for kind, fraction in stats.fractions.items()}
-    counts["recovered"] += f" (median sigma {stats.error:.1%} of the depth)" if stats.error is not None else ""
-    layout, (h, w) = task.layout, rows[0]["hw"]
-    lines = [
-        f"{task.scene.name}: {format_count(len(rows), 'frame')}{f' ({n_untouched} left untouched)' * (n_untouched > 0)}"
-        f" of {w}x{h}: {', '.join(counts.values())}{f' ({why})' if why else ''}",
-        f"  depth in steps of {1e3 * layout.unit:g} mm, up to {layout.reach:.1f} m"
-        + (f": {unfit:.2%} of the pixels are beyond it and left empty (see unit=, arrays=true)" if unfit else ""),
-    ]
-    if layout.name == "png" != task.settings["format"]:
-        lines.append("  maps only, not a recording: some frames have no pose")
-    if layout.pictures and has_varying_camera(rows):
-        lines.append("  the intrinsics change: K.txt has those of the first frame, meta/ those of every frame")
-    return "\n".join(lines)
-
-
-def _check_options(settings: Mapping[str, Any]) -> None:
-    """Validate options that would otherwise fail late."""
-    for name in ("max_frames", "every"):
-        value = settings[name]
-        if not (isinstance(value, int) and value >= 1) and not (name == "max_frames" and value is None):
-            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least 1")
-    choices_of = {
-        "format": ("auto", *FRAME_LAYOUTS),
-        "dtype": ("float32", "float64"),
-        **dict.fromkeys(EXTRA_FILES.keys() & settings.keys(), _EXTRAS_CHOICES),
-    }
-    for name, choices in choices_of.items():
-        if settings[name] not in choices:
-            shown = ", ".join(str(word).lower() for word in choices)
-            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {shown}")
-    for name, (low, high) in _OPTION_RANGES.items():
-        value = settings[name]
-        if value is not None and not (isinstance(value, int | float) and low < value <= high):
-            raise ValueError(f"{name}: found {value!r}, expected a number above {low:g}, at most {high:g}")
-    try:
-        torch.empty(0, device=settings["device"])
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(
-            f"device: found {settings['device']!r}, expected a device that torch can use on this machine"
-        ) from error

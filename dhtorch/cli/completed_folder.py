@@ -1,29 +1,42 @@
 """Folder of completed frames: shared metadata, list of complete frames, reading of their maps.
 
 A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: a frame with a meta file
-is complete. ``complete.json`` holds what all frames of a folder share.
+is complete. ``complete.json`` holds what all frames of a folder share. File layouts:
+
+- ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``, ``meta.json`` (unit, times, K of
+  every frame); steps of 1 mm, of 5 mm where the sensor is a LiDAR of a car. Read by ``frames_dir``.
+- ``tum``: ``rgb/`` and ``depth/`` by time stamp, ``groundtruth.txt``, ``calibration.txt``, ``meta.json`` (unit); steps
+  of 0.2 mm, so that it ends at 13.1 m.
+- ``stray``: ``depth/`` and ``confidence/`` (2 the sensor, 1 swept, 0 no answer) by frame number, the capture's own
+  tables and video; steps of 1 mm.
+- ``png``: the maps alone, as ``frames``.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from dhtorch.cli.layouts import Layout
+from dhtorch import export
 from dhtorch.codes import Gate, Source, count_kinds, names
 from dhtorch.data.io import decode as data_files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.export.frames import MAX_DEPTH_CODE, SIGMA_STEPS_PER_DEPTH_STEP
+from dhtorch.geometry.camera import from_matrix
+from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
+from dhtorch.records import Camera, Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.runtime.output_folder import OutputFolder, is_whole, open_output_folder
+from dhtorch.runtime.output_folder import is_whole, open_output_folder
 from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
@@ -33,6 +46,156 @@ _FORMAT_VERSION = 1
 
 #: Folder of derived files → their suffixes.
 EXTRA_FILES = {"figures": (".png",), "previews": (".jpg",), "points": (".ply", ".glb")}
+
+
+#: Depth step for sparse long-range sensors, whose range exceeds that of millimetre steps, m.
+_SPARSE_DEPTH_STEP_M = 0.005
+
+#: codes.Source → confidence value of a Stray capture.
+STRAY_CONFIDENCE = dict.fromkeys(names(Source), 1) | {Source.NONE: 0, Source.SENSOR: 2}
+
+#: Files of a Stray capture that do not depend on its depth.
+_STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
+
+#: Layout → names of the files beside the folders of its frames.
+_SIDE_FILES = {
+    "frames": ("K.txt", "meta.json", "poses.txt"),
+    "tum": ("meta.json", "calibration.txt", "groundtruth.txt"),
+    "stray": _STRAY_FILES,
+}
+
+#: Kind of file → suffix; ``.png`` otherwise.
+_FILE_SUFFIXES = {"meta": ".json", "arrays": ".npz"}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """File names, folders and depth step."""
+
+    name: str
+    unit: float  # m
+    pictures: str | None = None  # folder of the pictures
+    stamped: bool = False  # named by time instead of number
+    confidence: bool = False
+    arrays: bool = False
+    budget: bool = False
+
+    @property
+    def folders(self) -> list[str]:
+        """Folders of a frame's files in the order of writing."""
+        extra = [kind for kind in ("confidence", "arrays", "budget") if getattr(self, kind)]
+        return ["depth", "sigma", "source", *filter(None, [self.pictures]), *extra, "meta"]
+
+    @property
+    def sigma_unit(self) -> float:
+        """Step of sigma, m."""
+        return self.unit / SIGMA_STEPS_PER_DEPTH_STEP
+
+    @property
+    def reach(self) -> float:
+        """Largest depth that fits the 16 bits, m."""
+        return self.unit * MAX_DEPTH_CODE
+
+    @property
+    def side_files(self) -> tuple[str, ...]:
+        """Names of the files that :meth:`close` may write."""
+        return _SIDE_FILES.get(self.name, ())
+
+    def stem(self, recording: Recording, i: int) -> str:
+        """Stem of the file names of a frame."""
+        if self.stamped and recording.times is not None:
+            return f"{float(recording.times[i]):.6f}"
+        return f"{int(recording.number[i]):06d}"
+
+    def file(self, folder: Path, kind: str, stem: str) -> Path:
+        """Path of one file of a frame."""
+        return folder / kind / f"{stem}{_FILE_SUFFIXES.get(kind, '.png')}"
+
+    def close(self, folder: Path, recording: Recording, frames: Sequence[int], rows: Sequence[Row]) -> None:
+        """Write the camera, pose and time files that make ``frames`` (positions; metadata ``rows``) a recording."""
+        poses = None if recording.poses is None else recording.poses[torch.tensor(frames)]
+        if self.name == "frames" and poses is not None:
+            # Frames per second where frame number / rate equals the time stamps
+            rate, times = recording.rate_hz, recording.times
+            is_regular = (
+                rate is not None and times is not None and torch.allclose(recording.number.double() / rate, times)
+            )
+            timed: dict[str, Any] = (
+                {"fps": rate} if is_regular else {"times": None if times is None else times[list(frames)].tolist()}
+            )
+            export.write_frames_dir_metadata(folder, _read_cameras(rows), poses, unit=self.unit, **timed)
+        elif self.name == "tum":
+            stamps = [self.stem(recording, i) for i in frames]
+            export.write_tum_metadata(folder, _read_cameras(rows[:1]), stamps, poses, unit=self.unit)
+        elif self.name == "stray" and recording.root is not None:
+            for name in _STRAY_FILES:
+                storage.copy_file(recording.root / name, folder / name)
+
+
+FRAME_LAYOUTS = {
+    "frames": Layout("frames", 0.001, pictures="images"),
+    "tum": Layout("tum", 0.0002, pictures="rgb", stamped=True),
+    "stray": Layout("stray", 0.001, confidence=True),
+    "png": Layout("png", 0.001),
+}
+
+#: Format of a recording → its own layout; ``frames`` for all others.
+_LAYOUT_OF_FORMAT = {"tum": "tum", "stray": "stray"}
+
+
+def select_layout(
+    recording: Recording,
+    wanted: str,
+    unit: float | None,
+    *,
+    same: bool,
+    arrays: bool = False,
+    budget: bool = False,
+) -> Layout:
+    """The layout for the maps of a recording.
+
+    Args:
+        recording: whose frames are completed.
+        wanted: a name of ``FRAME_LAYOUTS``, or ``auto``: the recording's own, else ``frames``, else ``png``.
+        unit: m, a step of depth. None = the layout's own.
+        same: whether the maps have the size of the images.
+        arrays: whether NPZ files are written as well.
+        budget: whether maps of the largest cause of sigma are.
+
+    Raises:
+        ValueError: the layout cannot hold this recording, or its reader takes another unit.
+    """
+    names = [_LAYOUT_OF_FORMAT.get(recording.format, "frames"), "frames", "png"] if wanted == "auto" else [wanted]
+    lacks = {name: _find_lack(name, recording, same) for name in names}
+    if lacks[names[-1]]:
+        raise ValueError(f"format={wanted}: {recording.name} {lacks[names[-1]]}; use format=auto")
+    layout = FRAME_LAYOUTS[next(name for name, lack in lacks.items() if not lack)]
+    if layout.name == "stray" and unit not in (None, layout.unit):
+        raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only unit of format=stray")
+    if recording.sparse and layout.name in ("frames", "png"):
+        layout = replace(layout, unit=_SPARSE_DEPTH_STEP_M)
+    return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays, budget=budget)
+
+
+def _find_lack(name: str, recording: Recording, same: bool) -> str | None:
+    """The reason a recording does not fit a layout, None where it fits."""
+    if name == "frames":
+        poses = recording.poses
+        has_poses = poses is not None and bool(poses.t.isfinite().all() and poses.R.isfinite().all())
+        return None if has_poses else "has no pose for every frame"
+    if name == "tum" and recording.times is None:
+        return "has no time stamps"
+    if name == "tum" and not same:
+        return "has images larger than its maps (see size=)"
+    if name == "stray" and recording.format != "stray":
+        return f"is a {recording.format} recording, not a Stray Scanner capture"
+    return None
+
+
+def _read_cameras(rows: Sequence[Row]) -> Camera:
+    """Metadata rows -> cameras of their maps."""
+    lens = None if rows[0]["distortion"] is None else torch.tensor([row["distortion"] for row in rows])
+    return from_matrix(torch.tensor([row["K"] for row in rows]), lens)
 
 
 @dataclass(frozen=True)
@@ -54,6 +217,10 @@ class CompletionTask:
         """The scene's recording."""
         return self.scene.recording
 
+    def load(self, i: int) -> Frame:
+        """Frame ``i`` in the chosen dtype and device, returns beyond the cutoff hidden."""
+        return load_frame(self.scene, self.settings, i)
+
     def name(self, i: int) -> str:
         """Stem of the file names of frame ``i``."""
         return self.layout.stem(self.recording, i)
@@ -64,11 +231,6 @@ class CompletionTask:
         chosen = {kind: self.settings.get(kind, False) for kind in EXTRA_FILES}
         kinds = [kind for kind, which in chosen.items() if which == "all" or (which and i == first)]
         return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRA_FILES[kind]]
-
-    def files(self, i: int) -> list[Path]:
-        """All files that a frame ``i`` can have."""
-        extras = [self.folder / kind / f"{self.name(i)}{end}" for kind, ends in EXTRA_FILES.items() for end in ends]
-        return [*self.map_files(i), *extras]
 
     def map_files(self, i: int) -> list[Path]:
         """Files of the maps of frame ``i``."""
@@ -146,64 +308,48 @@ def open_task_folder(task: CompletionTask, more: Iterable[str] = ()) -> Iterator
         BlockingIOError: another process writes there.
         NotADirectoryError: the path is a file.
     """
+    shared_file, extras = task.folder / "complete.json", [kind for kind in EXTRA_FILES if task.settings.get(kind)]
     with open_output_folder(task.folder, "out") as folder:
-        _read_shared_file(task)
+        result_files.check_same_run(task.folder, shared_file, task.shared, "complete")
         task.done.update(read_complete_frames(task))
-        if folder.is_unlisted:
-            _adopt_older_version(task, folder)
-        _check_files(task, folder, more)
-        for i in range(len(task.recording)):
-            for path in task.files(i) if task.name(i) not in task.done else ():
-                folder.remove(path)
+        # Of every frame all files that it can have
+        ends = [(kind, end) for kind, suffixes in EXTRA_FILES.items() for end in suffixes]
+        files = {
+            task.name(i): [*task.map_files(i), *(task.folder / kind / f"{task.name(i)}{end}" for kind, end in ends)]
+            for i in range(len(task.recording))
+        }
+        if folder.is_unlisted and shared_file.is_file():  # of an older version, without a manifest, with this key
+            folder.adopt([*task.folder.iterdir(), *(path for name in task.done for path in files.get(name, ()))])
+        folder.check_folders(task.folder / kind for kind in (*task.layout.folders, *extras))
+        folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
+        for i in task.frames:
+            if task.name(i) not in task.done:
+                folder.check(task.map_files(i))
+            folder.check(path for path in task.extras(i) if not (path.is_file() and folder.lists(path)))
+        for path in (path for name in files.keys() - task.done for path in files[name]):
+            folder.remove(path)
         yield
-
-
-def _read_shared_file(task: CompletionTask) -> None:
-    """Check that the folder is empty, or was written with the same settings from the same data."""
-    folder, shared_file = task.folder, task.folder / "complete.json"
-    if not storage.has_files(folder):
-        return
-    if not shared_file.is_file():
-        raise FileExistsError(
-            f"out: {folder} holds other files, expected an empty folder, or one that this command wrote"
-        )
-    result_files.check_same_run(shared_file, task.shared, "complete")
-
-
-def _adopt_older_version(task: CompletionTask, folder: OutputFolder) -> None:
-    """Enter the files of a folder without a manifest whose ``complete.json`` has the key of this run: those of complete
-    frames, and those beside the frames' folders."""
-    complete = [i for i in range(len(task.recording)) if task.name(i) in task.done]
-    beside = list(task.folder.iterdir()) if (task.folder / "complete.json").is_file() else []
-    folder.adopt([*beside, *(path for i in complete for path in task.files(i))])
-
-
-def _check_files(task: CompletionTask, folder: OutputFolder, more: Iterable[str]) -> None:
-    """Raise FileExistsError for a link or a foreign file where the command writes."""
-    extras = [kind for kind in EXTRA_FILES if task.settings.get(kind)]
-    folder.check_folders(task.folder / kind for kind in (*task.layout.folders, *extras))
-    folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
-    for i in task.frames:
-        if task.name(i) not in task.done:
-            folder.check(task.map_files(i))
-        folder.check(path for path in task.extras(i) if not (path.is_file() and folder.lists(path)))
 
 
 def read_complete_frames(task: CompletionTask) -> dict[str, Row]:
     """Name -> meta row of the complete frames."""
-    metas = sorted((task.folder / "meta").glob("*.json"))
-    return {path.stem: row for path in metas if (row := _read_meta(task, path))}
+    rows: dict[str, Row] = {}
+    for path in sorted((task.folder / "meta").glob("*.json")):
+        # Left out where a file is missing, invalid or of another key
+        if all(is_whole(task.layout.file(task.folder, kind, path.stem)) for kind in task.layout.folders):
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                row = storage.parse_strict_json(storage.read_utf8(path))
+                if row["key"] == task.shared["key"]:
+                    rows[path.stem] = row
+    return rows
 
 
-def _read_meta(task: CompletionTask, path: Path) -> Row | None:
-    """The meta row of a frame, None where a file is missing, invalid or of another key."""
-    if not all(is_whole(task.layout.file(task.folder, kind, path.stem)) for kind in task.layout.folders):
-        return None
-    try:
-        row: Row = storage.parse_strict_json(storage.read_utf8(path))
-        return row if row["key"] == task.shared["key"] else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
+    """Frame ``i`` of a scene in the chosen dtype and device, returns beyond the cutoff hidden."""
+    frame = scene.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
+    if 0 in frame.hw:
+        raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
+    return range_split(frame, settings["cutoff"])
 
 
 def format_frame_title(task: CompletionTask, i: int) -> str:

@@ -16,7 +16,8 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dhtorch.cli import enrich_card, enrich_page
+from dhtorch.cli import enrich_page
+from dhtorch.cli.option_checks import validate_choices
 from dhtorch.codes import words
 from dhtorch.data.io.decode import import_optional
 from dhtorch.data.rig import Rig
@@ -111,7 +112,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         with open_output_folder(work.out, "out") as folder:
             before, owns, complaints = _write_missing_episodes(work, folder, settings, progress)
             if isinstance(work.target, LeRobotTarget):
-                enrich_card.write_enrich_card(work.target, work.shared, owns)
+                enrich_page.write_enrich_card(work.target, work.shared, owns)
             if settings["report"]:
                 enrich_page.write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
@@ -134,7 +135,18 @@ def _write_missing_episodes(
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
     every = work.whole.shards(settings["shard_rows"], apart=True)
-    _prepare_folder(work, folder, [k for k, own in enumerate(owns) if own is None])
+    # Prepare the output folder for the episodes ``missing``
+    missing = [k for k, own in enumerate(owns) if own is None]
+    metadata_file = work.out / "meta" / METADATA_FILE
+    result_files.check_same_run(work.out, metadata_file, work.shared, "enrich")
+    if folder.is_unlisted and metadata_file.is_file():  # of an older version
+        folder.adopt(work.out.rglob("*"))
+    folder.check_folders([work.waiting])
+    card = [work.out / enrich_page.CARD] if isinstance(work.target, LeRobotTarget) else []
+    folder.check([*work.target.planned_files(missing), *card, *enrich_page.page_files(work.out / "meta")])
+    if not metadata_file.is_file():
+        storage.write_json(metadata_file, work.shared)
+    work.waiting.mkdir(exist_ok=True)
     done = shards.find_finished_shards(work.waiting, work.shared)
     todo = {k: _group_shards(every, work.whole, of_episode[k]) for k, own in enumerate(owns) if own is None}
     pieces = [piece for each in todo.values() for files in each.values() for piece in files if piece.name not in done]
@@ -150,7 +162,8 @@ def _write_missing_episodes(
                 kept = engines.filter_rows(answered, settings["on_error"], work.rows, complaints, "on_error=flag")
                 shards.write_shard(work.waiting, piece, kept, work.rows.wanted, work.shared)
             files = {
-                _camera_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()
+                camera_key(work.scenes[work.whole.order[n]].recording): [work.waiting / p.name for p in own_pieces]
+                for n, own_pieces in each.items()
             }
             owns[k] = work.target.assemble(k, [own for own in owns[:k] if own is not None], files)
             for path in (path for paths in files.values() for path in paths):
@@ -372,28 +385,6 @@ def _build_metadata(
     return metadata
 
 
-def _prepare_folder(work: EnrichJob, folder: OutputFolder, missing: Sequence[int]) -> None:
-    """Prepare the output folder for the episodes ``missing``.
-
-    Raises:
-        FileExistsError: it holds other files, or was written from other data or with other options, or a link or a
-            foreign file is in the way.
-    """
-    metadata_file = work.out / "meta" / METADATA_FILE
-    if metadata_file.is_file():
-        result_files.check_same_run(metadata_file, work.shared, "enrich")
-        if folder.is_unlisted:  # of an older version
-            folder.adopt(work.out.rglob("*"))
-    elif storage.has_files(work.out):
-        raise FileExistsError(f"{work.out}: found a folder with other files, expected an empty or a new one")
-    folder.check_folders([work.waiting])
-    card = [work.out / enrich_card.CARD] if isinstance(work.target, LeRobotTarget) else []
-    folder.check([*work.target.planned_files(missing), *card, *enrich_page.page_files(work.out / "meta")])
-    if not metadata_file.is_file():
-        storage.write_json(metadata_file, work.shared)
-    work.waiting.mkdir(exist_ok=True)
-
-
 def _group_by_episode(whole: plan.ExtractionPlan) -> list[list[int]]:
     """Positions of the recordings in the plan, grouped by episode."""
     groups: dict[int, list[int]] = {}
@@ -408,10 +399,6 @@ def _group_shards(
     """Position of a recording in the plan → its shards."""
     spans = whole.spans
     return {n: [p for p in every if spans[n].start <= p.rows.start < spans[n].stop] for n in group}
-
-
-def _camera_key(work: EnrichJob, n: int) -> str:
-    return camera_key(work.scenes[work.whole.order[n]].recording)
 
 
 # ------------------------------------------------------------------------------------------------------------- summary
@@ -445,9 +432,7 @@ def _check_options(settings: Mapping[str, Any]) -> None:
         "pose": _POSE_SOURCES,
         "maps": _MAP_FORMS,
     }
-    for name, choices in choices_of.items():
-        if settings[name] not in choices:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
+    validate_choices(settings, choices_of)
     wanted = settings["columns"]
     known = (*MAP_FILES, *POLICY_COLUMNS)
     if not isinstance(wanted, Sequence) or isinstance(wanted, str) or not {"depth"} <= {*wanted} <= {*known}:
@@ -455,20 +440,6 @@ def _check_options(settings: Mapping[str, Any]) -> None:
     if settings["format"] == "nerfstudio" and {*wanted} & {*POLICY_COLUMNS, "cause"}:
         more = ", ".join(name for name in (*POLICY_COLUMNS, "cause") if name in wanted)
         raise ValueError(f"columns: found {more} with format=nerfstudio, expected a LeRobot format")
-    for name in ("causal", "report", "cameras"):
-        if not isinstance(settings[name], bool):
-            raise ValueError(f"{name}: found {settings[name]!r}, expected true or false")
-    for name, low in (("workers", 0), ("shard_rows", 1), ("gap", 0)):
-        value = settings[name]
-        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not is_whole and not (name == "gap" and value == plan.AUTO_GAP):
-            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     if settings["pose_sigma"] is not None and settings["pose"] == "near":
         raise ValueError(f"pose_sigma: found {settings['pose_sigma']} with pose=near, expected pose=device or start")
     poses.parse_pose_sigmas(settings["pose_sigma"], "pose_sigma")
-    for name, high in (("step", 1.0), ("fps", 1e4)):
-        value = settings[name]
-        least = 0.0 if name == "step" else 1e-4
-        is_number = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= high
-        if not is_number and not (name == "fps" and value is None):
-            raise ValueError(f"{name}: found {value!r}, expected a number from {least:g} to {high:g}")

@@ -1,8 +1,14 @@
-"""HTML report of an enriched data set: outcome of its pixels by camera, over time and by episode."""
+"""HTML report of an enriched data set (its pixels by camera, over time and by episode), and its data set card.
+
+The card of a LeRobot set is ``README.md`` with the tags of the Hugging Face hub: cameras with their intrinsics, where
+their depth comes from and how exact it is, versions, the licence of the source, and how the set is loaded and trained
+on. The card of the source is kept as ``README.source.md``.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import reduce
@@ -14,12 +20,16 @@ import numpy as np
 
 from dhtorch.cli.gate_messages import describe_gate
 from dhtorch.codes import SOURCES_OF_KIND, Gate, Source, count_kinds, names, words
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import import_optional
 from dhtorch.experiments.report.figures import Figure
 from dhtorch.experiments.report.page import PAGE_CSS, figures_markup, table_markup
 from dhtorch.experiments.report.tables import ReportTable
 from dhtorch.export.lerobot import LogHistogram
 from dhtorch.extract.enriched import NO_ANSWER_REASONS, NO_OTHER_VIEW
-from dhtorch.extract.origin import REPORT_FILES
+from dhtorch.extract.origin import REPORT_FILES, SOURCE_CARD
+from dhtorch.extract.policy_columns import N_POINTS
+from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.targets import UNKNOWN_CONVENTION
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
@@ -76,9 +86,10 @@ def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
         refuted = sum((Counter(camera["refuted"]) for camera in cameras), Counter())
         if refuted:
             frames = f"{refuted.total()} of {format_count(sum(camera['frames'] for camera in cameras), 'frame')}"
-            sentences.append(
-                f"{name}: the input poses contradict the near returns in {frames}{_describe_readings(refuted)}"
-            )
+            known = {reading: n for reading, n in refuted.items() if reading != UNKNOWN_CONVENTION}
+            fits = " or ".join(f"{reading} ({n})" if len(refuted) > 1 else reading for reading, n in known.items())
+            end = f"they fit as {fits}" if known else "no known convention fits"
+            sentences.append(f"{name}: the input poses contradict the near returns in {frames}; {end}")
     return sentences
 
 
@@ -94,30 +105,21 @@ def write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
     codes = {"pixels": names(Source), "no_answer": NO_ANSWER_REASONS}
     numbers, page = page_files(folder)
     storage.write_json(numbers, {"data": about["data"], "codes": codes, "episodes": listed})
-    return storage.replace_file(page, _build_page(about, owns).encode("utf-8"))
-
-
-def _build_page(about: Row, owns: Sequence[Row]) -> str:
-    """The page as HTML.
-
-    Args:
-        about: metadata shared by all episodes.
-        owns: statistics of each episode, from :class:`dhtorch.extract.targets.DatasetTarget`.
-    """
+    # The page as HTML
     title = f"{about['data']['source']}: outcome of its pixels"
     frames = sum(own["length"] for own in owns)
     step = f"depth in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "depth not quantised"
     episodes = f"{format_count(len(owns), 'episode')}, {format_count(frames, 'frame')}"
     lead = f"{episodes}; {step}; dhtorch {about['version']}, method {about['method']}"
-    tables = [
-        table
-        for table in (_build_camera_table(owns), _build_refuted_table(owns), _build_worst_table(owns))
-        if table.rows
+    tables = (_build_camera_table(owns), _build_refuted_table(owns), _build_worst_table(owns))
+    parts = [
+        *(table_markup(table) for table in tables if table.rows),
+        figures_markup([f for f in (_build_time_figure(owns), _build_reason_figure(owns)) if f is not None]),
     ]
-    figures = [figure for figure in (_build_time_figure(owns), _build_reason_figure(owns)) if figure is not None]
-    parts = [*(table_markup(t) for t in tables), figures_markup(figures)]
     top = make_tag("header", make_tag("h1", title), make_tag("p", lead, class_="lead"))
-    return build_document(title, top, make_tag("main", *parts), own=PAGE_CSS)
+    return storage.replace_file(
+        page, build_document(title, top, make_tag("main", *parts), own=PAGE_CSS).encode("utf-8")
+    )
 
 
 def _pixel_shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
@@ -137,13 +139,6 @@ def _pixel_shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, f
 def _list_cameras(owns: Sequence[Row]) -> list[str]:
     """Names of all cameras, in order of appearance."""
     return list(dict.fromkeys(name for own in owns for name in own["cameras"]))
-
-
-def _describe_readings(refuted: Mapping[str, int]) -> str:
-    """End of the sentence about refuted poses: the conventions that would fit."""
-    known_readings = {reading: n for reading, n in refuted.items() if reading != UNKNOWN_CONVENTION}
-    readings = " or ".join(f"{reading} ({n})" if len(refuted) > 1 else reading for reading, n in known_readings.items())
-    return f"; they fit as {readings}" if known_readings else "; no known convention fits"
 
 
 def _build_camera_table(owns: Sequence[Row]) -> ReportTable:
@@ -241,3 +236,129 @@ def _average_over_episodes(owns: Sequence[Row], column: str) -> list[tuple[str, 
         ]
         averages.append((name, np.mean(resampled, 0)))
     return averages
+
+
+# ------------------------------------------------------------------------------------------------------ data set card
+
+#: Name of the card.
+CARD = "README.md"
+
+#: ``license:`` in the head of a card, as the hub writes identifiers of licences.
+_LICENCE = re.compile(r"\A---\n(?:.*\n)*?license:[ \t]*[\"']?([A-Za-z0-9][A-Za-z0-9.\-]{0,40})[\"']?[ \t]*\n")
+
+
+def write_enrich_card(target: LeRobotTarget, about: Mapping[str, Any], owns: Sequence[Mapping[str, Any]]) -> Path:
+    """Write the card of a complete set; ``about``: metadata of all files, ``owns``: summaries of all episodes."""
+    root = target.root
+    info = files.read_json(root / "meta" / "info.json")
+    stats = files.read_json(root / "meta" / "stats.json")
+    card = root / SOURCE_CARD
+    stated = _LICENCE.match(files.read_text(card).replace("\r\n", "\n")) if card.is_file() else None
+    licence = None if stated is None else stated[1]
+    source = _plain(about["data"]["source"])
+    head = ["---", *([f"license: {licence}"] if licence else []), "task_categories:", "- robotics", "tags:"]
+    head += ["- LeRobot", "- depth", "- dhtorch", "configs:", "- config_name: default"]
+    head += ["  data_files: data/*/*.parquet", "---", "", f"# {_plain(about['data']['name'])} with depth", ""]
+    frames = format_count(info["total_frames"], "frame")
+    size = f"{format_count(info['total_episodes'], 'episode')}, {frames} at {info['fps']:g} per second"
+    writer = f"dhtorch {about['version']} (`dhtorch enrich`, method {about['method']})"
+    code = info["codebase_version"]
+    body = [f"LeRobot {code} set, written from `{source}` by {writer}: {size}.", ""]
+    columns = (
+        "camera",
+        "picture",
+        "map",
+        "fx, fy, cx, cy (px)",
+        *map(words, SOURCES_OF_KIND),
+        "depth (m)",
+        "sigma (m)",
+    )
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    cameras = {camera.name: camera for camera in summarise_cameras(owns)}
+    # Of each camera fx, fy, cx, cy of the first row that has them
+    parquet, K = import_optional("pyarrow.parquet"), {}
+    present = set(parquet.read_schema(target.file(0)).names)
+    for key, view in target.views.items():
+        column = f"observation.{view.name}.intrinsics"
+        if column in present:
+            rows = np.array(parquet.read_table(target.file(0), columns=[column]).column(column).to_pylist(), np.float64)
+            valid = rows[np.isfinite(rows).all(1)] if rows.ndim == 2 and rows.shape[1] == 9 else rows[:0]
+            if len(valid):
+                K[key] = valid[0][[0, 4, 2, 5]].tolist()
+    for key, view in target.views.items():
+        camera = cameras.get(view.name)
+        percent = ["0.0%"] * len(SOURCES_OF_KIND) if camera is None else camera.format_kinds().values()
+        numbers = K.get(key)
+        lens = "unknown" if numbers is None else ", ".join(f"{x:.1f}" for x in numbers)
+        depth, sigma = (stats.get(target.keys[key].get(name, "")) for name in ("depth", "sigma"))
+        span = typical = "–"
+        if camera is not None and camera.kinds["no_answer"] != 1 and depth is not None:
+            low, high = (float(np.ravel(depth[name])[0]) for name in ("q01", "q99"))
+            span = f"{low:.2f}–{high:.2f}"
+            typical = "–" if sigma is None else f"{float(np.ravel(sigma['q50'])[0]):.4f}"
+        sizes = [f"{w}×{h}" for h, w in (view.hw, view.map_hw)]
+        lines.append(f"| {' | '.join([f'`{key}`', *sizes, lens, *percent, span, typical])} |")
+    body += ["## Cameras", "", *lines, ""]
+    body += [*_describe_maps(target, about, info), ""]
+    known = f"`{licence}`, by its card (`{SOURCE_CARD}`)" if licence else "not stated by the source"
+    body += ["## Licence", "", f"Pictures, states and actions are the source's: {known}.", ""]
+    return storage.replace_file(
+        target.root / CARD, ("\n".join([*head, *body, *_describe_loading(target, info)]) + "\n").encode("utf-8")
+    )
+
+
+def _describe_maps(target: LeRobotTarget, about: Mapping[str, Any], info: Mapping[str, Any]) -> list[str]:
+    """Sentences on the columns of a camera, and how the set is loaded and trained on."""
+    keys = target.keys[next(iter(target.views))]
+    step = f"in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "not quantised"
+    form = "32-bit TIFF" if target.as_images else "an array of numbers (1, h, w)"
+    lines = [
+        f"`{keys['depth']}` is {form} in metres, {step}; **0 = no depth**, which is no distance: mask it",
+        "before depth is normalised. Statistics in `meta/stats.json` are over answered pixels, their range holds the",
+        "values from the 1 % to the 99 % quantile, as the depths of the table do; its sigma is the median.",
+    ]
+    if "sigma" in keys:
+        lines.append(f"`{keys['sigma']}` is the standard deviation of the depth, in metres.")
+    if "source" in keys:
+        codes = ", ".join(f"{code} {name.lower()}" for code, name in names(Source).items())
+        lines.append(f"`{keys['source']}` is where a depth comes from: {codes}.")
+    if "geometry_image" in keys:
+        stated = info["features"][keys["geometry_image"]]["info"]
+        decoding = stated["geometry_image"]
+        lines += [
+            f"`{keys['geometry_image']}` is a video without loss ({stated['video.codec']}, {stated['video.pix_fmt']}) "
+            "of bytes that decode as",
+            f"`depth_m = {decoding['depth_m']}`,",
+            f"`sigma_m = {decoding['sigma_m']}`,",
+            f"`source = {decoding['source']}` (`{decoding['function']}`);",
+            "encoded again with loss, its depth is no longer exact to half a code.",
+        ]
+    if "point_cloud" in keys:
+        lines += [
+            f"`{keys['point_cloud']}` is {N_POINTS} points (x right, y down, z forward) in metres",
+            "of the camera, by pixels with a depth in a fixed order; they repeat where there are fewer, and are",
+            "all 0 in a frame without depth. Its first points are a smaller cloud of the whole picture.",
+        ]
+    if "K" in keys:
+        lines.append(f"`{keys['K']}` is K of the picture by rows; pixel centres are whole numbers.")
+    return lines
+
+
+def _describe_loading(target: LeRobotTarget, info: Mapping[str, Any]) -> list[str]:
+    """How the set is loaded and trained on."""
+    depth = target.keys[next(iter(target.views))]["depth"]
+    lines = ["## Loading", "", "```python", "from lerobot.datasets.lerobot_dataset import LeRobotDataset", ""]
+    lines += [
+        'dataset = LeRobotDataset("local/set", root="THIS_FOLDER")',
+        f'depth = dataset[0]["{depth}"]  # (1, h, w)',
+    ]
+    lines += ["```"]
+    if {"action", "observation.state"} <= info["features"].keys() and not target.as_images:
+        train = "lerobot-train --dataset.repo_id=local/set --dataset.root=THIS_FOLDER --policy.type=act"
+        lines += ["", "```bash", f"{train} --policy.push_to_hub=false", "```"]
+    return lines
+
+
+def _plain(text: Any) -> str:
+    """Text in one line without marks of tables and code."""
+    return re.sub(r"[\s|`<>]+", " ", str(text)).strip()

@@ -22,7 +22,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 from dhtorch.runtime import console, storage
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, open_output_folder
@@ -99,7 +99,9 @@ def main(argv: Sequence[str]) -> int:
     for scene in scenes:
         digest = "" if not scene.archive or scene.archive_sha256 else "; digest of the archive unknown, files checked"
         print(f"{scene.folder}: {scene.licence}; {scene.source}{digest}")
-    if not options.yes and not _is_accepted():
+    if not options.yes and not (
+        sys.stdin.isatty() and input("Accept these licences? [y/N] ").strip().lower() in ("y", "yes")
+    ):
         print("dhtorch: licences not accepted, nothing fetched; --yes accepts them", file=sys.stderr)
         return 2
     n = fetch_scenes(scenes, out)
@@ -107,11 +109,6 @@ def main(argv: Sequence[str]) -> int:
         f"{console.format_count(n, 'file')} fetched into {out}; for data={options.set} set DHTORCH_DATA={out.resolve()}"
     )
     return 0
-
-
-def _is_accepted() -> bool:
-    """Whether a person at a terminal accepts the licences."""
-    return sys.stdin.isatty() and input("Accept these licences? [y/N] ").strip().lower() in ("y", "yes")
 
 
 def fetch_scenes(scenes: Sequence[FetchedScene], out: Path, *, max_bytes: int = MAX_BYTES) -> int:
@@ -194,7 +191,17 @@ def download(address: str, folder: Path, digest: str | None, max_bytes: int = MA
         with _open_address(address, start) as answer:
             start = start if answer.status == http.HTTPStatus.PARTIAL_CONTENT else 0
             length = answer.headers.get("Content-Length")
-            total = _append(answer, part, start, max_bytes, address)
+            # Write an answer to a file from byte ``start`` on → size of the file
+            total = start
+            with part.open("r+b" if start else "wb") as file:
+                file.seek(start)
+                while block := answer.read(_BLOCK_BYTES):
+                    total += len(block)
+                    if total > max_bytes:
+                        file.close()
+                        part.unlink()
+                        raise ValueError(f"{address}: found more than {max_bytes} bytes, expected at most that")
+                    file.write(block)
     except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
         raise OSError(f"{address}: {getattr(error, 'reason', None) or error}; run again to go on") from None
     if length is not None and total < start + int(length):
@@ -218,21 +225,6 @@ def _open_address(address: str, start: int) -> Any:
         if start and error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             return _open_address(address, 0)
         raise
-
-
-def _append(answer: IO[bytes], part: Path, start: int, max_bytes: int, address: str) -> int:
-    """Write an answer to a file from byte ``start`` on → size of the file."""
-    total = start
-    with part.open("r+b" if start else "wb") as file:
-        file.seek(start)
-        while block := answer.read(_BLOCK_BYTES):
-            total += len(block)
-            if total > max_bytes:
-                file.close()
-                part.unlink()
-                raise ValueError(f"{address}: found more than {max_bytes} bytes, expected at most that")
-            file.write(block)
-    return total
 
 
 def _open_archive(file: Path, address: str) -> tarfile.TarFile | zipfile.ZipFile:

@@ -106,31 +106,33 @@ def main(argv: Sequence[str]) -> int:
     links = reader_options.pop("follow_links", False)
     if not isinstance(links, bool):
         raise ValueError(f"data.follow_links: found {links!r}, expected true or false")
-    is_auto = options.format == "auto"
-    captures = find_captures(options.path, links) if is_auto else [_capture_of_format(options.path, options.format)]
+    if options.format == "auto":
+        captures = find_captures(options.path, links)
+    elif options.format in data.FORMATS or options.format in formats.STACK_FORMATS:
+        kind = "stacks" if options.format in formats.STACK_FORMATS else "recording"
+        captures = [FoundCapture(options.path, kind, options.format, "format= given")]
+    else:
+        known = ", ".join(("auto", *data.FORMATS, *formats.STACK_FORMATS))
+        raise FormatError(options.path, "format", options.format, known)
     captures = [replace(capture, follow_links=links, options=reader_options) for capture in captures]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S-%f}"
+    root, sheets = options.path, list[Path]()
     with open_output_folder(out, "--out"):
-        _survey_captures(captures, options.path, options.max_frames, out)
+        try:
+            for capture in captures:
+                for survey in survey_capture(capture, options.max_frames):
+                    parts = capture.path.relative_to(root).parts
+                    survey.name = "/".join((root.resolve().name, *parts[:-1], survey.name)) if parts else survey.name
+                    print_survey(capture, survey)
+                    sheets.append(write_contact_sheet(survey, out))
+                    print(f"wrote {sheets[-1]}\n")
+            if captures[0].kind == "pictures":
+                print(f"{root}: {describe_pictures(root, captures)}")
+        except KeyboardInterrupt:
+            stay = f"{format_count(len(sheets), 'contact sheet')} in {out} kept; " if sheets else ""
+            raise KeyboardInterrupt(f"{stay}run the same command again for the rest") from None
     return 0
-
-
-def _survey_captures(captures: Sequence[FoundCapture], root: Path, n_frames: int, out: Path) -> None:
-    """Print the content of captures and write their contact sheets into ``out``."""
-    sheets: list[Path] = []
-    try:
-        for capture in captures:
-            for survey in survey_capture(capture, n_frames):
-                survey.name = _full_name(root, capture.path, survey.name)
-                print_survey(capture, survey)
-                sheets.append(write_contact_sheet(survey, out))
-                print(f"wrote {sheets[-1]}\n")
-        if captures[0].kind == "pictures":
-            print(f"{root}: {describe_pictures(root, captures)}")
-    except KeyboardInterrupt:
-        stay = f"{format_count(len(sheets), 'contact sheet')} in {out} kept; " if sheets else ""
-        raise KeyboardInterrupt(f"{stay}run the same command again for the rest") from None
 
 
 def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
@@ -151,7 +153,12 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
             if foreign := describe_layout(folder):
                 raise FormatError(folder, "content", foreign.what, foreign.remedy)
     for candidates in levels:
-        if captures := _recognise_all(candidates, formats.STACK_FORMATS, follow_links) or _find_pictures(candidates):
+        if captures := _recognise_all(candidates, formats.STACK_FORMATS, follow_links) or [
+            FoundCapture(folder, "pictures", "loose pictures", f"{format_count(count, 'picture')} of no known format")
+            for folder in candidates
+            if folder.is_dir()
+            if (count := sum(file.suffix.lower() in _IMAGE_SUFFIXES for file in folder.iterdir()))
+        ]:
             return captures
     content, remedy = _describe_content(path)
     expected = f"{PHONE_EXPORTS}; or one of the {len(data.FORMATS)} formats of docs/data.md"
@@ -183,15 +190,11 @@ def _describe_content(path: Path) -> tuple[str, str | None]:
         return "an empty folder", None
     if foreign := describe_foreign_folder(path):
         return foreign.what, foreign.remedy
-    for file in sorted(list_files(path), key=_search_order):
+    # Files of upper folders first, in natural order
+    for file in sorted(list_files(path), key=lambda file: (len(file.parts), files.natural_sort_key(file))):
         if foreign := describe_foreign_file(file):
             return f"{file.relative_to(path)}: {foreign.what}", foreign.remedy
     return f"no capture here or up to two folders below: {describe_content(path)}", None
-
-
-def _search_order(file: Path) -> tuple[object, ...]:
-    """Files of upper folders first, in natural order."""
-    return (len(file.parts), files.natural_sort_key(file))
 
 
 def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
@@ -200,15 +203,24 @@ def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
     A folder that its reader rejects is surveyed as loose images, with the reader's message as a warning, unless reader
     options are set: these may be what it rejects.
     """
+    links = capture.follow_links
     try:
-        for survey in _SURVEYS_BY_KIND[capture.kind](capture, frames):
+        if capture.kind == "recording":
+            surveys = _survey_recordings(capture, frames)
+        elif capture.kind == "stacks":
+            surveys = iter(
+                [survey_stacks(formats.open_stacks(capture.path, capture.format, follow_links=links), frames)]
+            )
+        else:
+            surveys = iter([_survey_loose_pictures(capture, frames)])
+        for survey in surveys:
             if capture.options and capture.kind != "recording":
                 survey.warn(f"not a recording: {', '.join(f'data.{name}' for name in capture.options)} not used")
             yield survey
     except FormatError as error:
         if capture.options or not capture.path.is_dir() or not any(classify_images(capture.path)):
             raise
-        (survey,) = _survey_loose_pictures(capture, frames)
+        survey = _survey_loose_pictures(capture, frames)
         survey.warnings.insert(0, f"the {capture.format} reader rejects it: {error}")
         yield survey
 
@@ -239,20 +251,6 @@ def _parse_value(text: str) -> Any:
 # -------------------------------------------------------------------------------------------------------------- search
 
 
-def _full_name(inspected: Path, path: Path, name: str) -> str:
-    """Name of a capture with its folders below the inspected path: the last folder alone may be called ``9``."""
-    parts = path.relative_to(inspected).parts
-    return "/".join((inspected.resolve().name, *parts[:-1], name)) if parts else name
-
-
-def _capture_of_format(path: Path, format: str) -> FoundCapture:
-    if format in formats.STACK_FORMATS:
-        return FoundCapture(path, "stacks", format, "format= given")
-    if format not in data.FORMATS:
-        raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *formats.STACK_FORMATS)))
-    return FoundCapture(path, "recording", format, "format= given")
-
-
 def _recognise_all(candidates: Sequence[Path], readers: Mapping[str, Any], follow_links: bool) -> list[FoundCapture]:
     """Captures at exactly these paths, each with the first of the formats that recognises it."""
     kind = "stacks" if readers is formats.STACK_FORMATS else "recording"
@@ -262,20 +260,6 @@ def _recognise_all(candidates: Sequence[Path], readers: Mapping[str, Any], follo
             formats_of_path = ((name, text) for name, reader in readers.items() if (text := reader.recognise(path)))
             captures += [FoundCapture(path, kind, *each) for each in islice(formats_of_path, 1)]
     return captures
-
-
-def _find_pictures(candidates: Sequence[Path]) -> list[FoundCapture]:
-    """The folders among the candidates that have images."""
-    counts = {
-        folder: sum(file.suffix.lower() in _IMAGE_SUFFIXES for file in folder.iterdir())
-        for folder in candidates
-        if folder.is_dir()
-    }
-    return [
-        FoundCapture(folder, "pictures", "loose pictures", f"{format_count(count, 'picture')} of no known format")
-        for folder, count in counts.items()
-        if count
-    ]
 
 
 def describe_pictures(path: Path, captures: Sequence[FoundCapture]) -> str:
@@ -315,23 +299,18 @@ def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
             survey.facts = [(what, text) for what, text in survey.facts if what != "intrinsics"]
             survey.warnings = [line for line in survey.warnings if intrinsics_options.find_guess_report([line]) is None]
         survey.warnings.extend(warning)
-        add_check(survey, recording)
+        check = check_capture(recording, survey.decoded)
+        unit = check.assumed_unit or (str(recording.depth_unit) if recording.depth_unit is not None else "")
+        if unit:
+            survey.add_fact("unit", unit)
+        if check.poses is not None:
+            surfaces = check.poses.surfaces
+            agreement = f"agree to {100 * surfaces.stated:.2f} % from frame to frame"
+            survey.add_fact("depth and poses", f"{agreement} ({100 * surfaces.without:.2f} % without poses)")
+        for limit in check.limits:
+            survey.add_fact("not checked", limit)
+        survey.warnings.extend(str(finding) for finding in check.findings)
         yield survey
-
-
-def add_check(survey: Survey, recording: Recording) -> None:
-    """Add what the check of the capture shows to its survey: unit, agreement of poses and depth, findings."""
-    check = check_capture(recording, survey.decoded)
-    unit = check.assumed_unit or (str(recording.depth_unit) if recording.depth_unit is not None else "")
-    if unit:
-        survey.add_fact("unit", unit)
-    if check.poses is not None:
-        surfaces = check.poses.surfaces
-        agreement = f"agree to {100 * surfaces.stated:.2f} % from frame to frame"
-        survey.add_fact("depth and poses", f"{agreement} ({100 * surfaces.without:.2f} % without poses)")
-    for limit in check.limits:
-        survey.add_fact("not checked", limit)
-    survey.warnings.extend(str(finding) for finding in check.findings)
 
 
 def _open_recordings(capture: FoundCapture, warning: list[str]) -> Sequence[Recording]:
@@ -346,10 +325,6 @@ def _open_recordings(capture: FoundCapture, warning: list[str]) -> Sequence[Reco
             warnings.simplefilter("ignore")
             return data.open_all(capture.path, capture.format, **{**reader_options, "fov": _ASSUMED_FOV_DEG})
     return recordings
-
-
-def _survey_stacks(capture: FoundCapture, frames: int) -> Iterator[Survey]:
-    yield survey_stacks(formats.open_stacks(capture.path, capture.format, follow_links=capture.follow_links), frames)
 
 
 def classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -367,31 +342,24 @@ def classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
     return pictures, depths
 
 
-def _survey_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]:
+def _survey_loose_pictures(capture: FoundCapture, frames: int) -> Survey:
     """Survey of evenly picked images and depth maps of a folder; 16-bit images are taken as millimetres."""
-    with doors.restrict_links(None if capture.follow_links else capture.path):
-        yield from _read_loose_pictures(capture, frames)
-
-
-def _read_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]:
-    pictures, depths = classify_images(capture.path)
     shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
-    for kind, sources in (("image", pictures), ("depth", depths)):
-        for file in spread_evenly(sources, frames):
-            try:
-                picture = files.read_image(file) if kind == "image" else files.read_depth_png(file, 1000.0)
-                shown[kind][file.name] = torch.from_numpy(picture)
-            except FormatError as error:
-                unreadable.append(str(error))
+    with doors.restrict_links(None if capture.follow_links else capture.path):
+        pictures, depths = classify_images(capture.path)
+        for kind, sources in (("image", pictures), ("depth", depths)):
+            for file in spread_evenly(sources, frames):
+                try:
+                    picture = files.read_image(file) if kind == "image" else files.read_depth_png(file, 1000.0)
+                    shown[kind][file.name] = torch.from_numpy(picture)
+                except FormatError as error:
+                    unreadable.append(str(error))
     survey = survey_pictures(capture.path.resolve().name, shown["image"], shown["depth"])
     if depths:
         survey.warn("16-bit images are taken as depth in millimetres")
     survey.warnings.extend(unreadable)
-    yield survey
-
-
-_SURVEYS_BY_KIND = {"recording": _survey_recordings, "stacks": _survey_stacks, "pictures": _survey_loose_pictures}
+    return survey
 
 
 # ------------------------------------------------------------------------------------------------------------- output
@@ -463,20 +431,36 @@ def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
             picture = getattr(tile, kind)
             if picture is None:
                 continue
-            extent = _extent(k, picture.shape[-2:], height)
-            _draw_tile(axes, picture, kind, limits, extent)
+            hw = picture.shape[-2:]
+            half_width = (0.5 - _TILE_GAP) * min(1.0, height * hw[1] / hw[0])
+            half_height = half_width * hw[0] / hw[1]
+            extent = k + 0.5 - half_width, k + 0.5 + half_width, height / 2 - half_height, height / 2 + half_height
+            step = max(1, max(picture.shape[-2:]) // 400)
+            if kind == "image":
+                pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
+                axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY_CMAP, extent=extent)
+            elif kind == "depth":
+                sparse = float((picture > 0).double().mean()) < _SPARSE_SHARE
+                shown = _nearest_per_block(picture, 3 * step) if sparse else picture[::step, ::step]
+                masked = np.ma.masked_equal(shown.numpy(), 0)
+                axes.imshow(masked, cmap=DEPTH_CMAP, vmin=limits[0], vmax=limits[1], extent=extent)
+                # Outline of a depth map, whose holes are white
+                from matplotlib.patches import Rectangle  # noqa: PLC0415
+
+                left, right, bottom, top = extent
+                axes.add_patch(
+                    Rectangle(
+                        (left, bottom), right - left, top - bottom, fill=False, edgecolor=UNANSWERED, linewidth=0.6
+                    )
+                )
+            else:
+                pixels = picture[::step, ::step].numpy()
+                axes.imshow(pixels, cmap=SCORE_CMAP, vmin=0, vmax=2, interpolation="nearest", extent=extent)
             if not any(getattr(tile, above) is not None for above in rows[:r]):
                 place = (extent[0] + extent[1]) / 2, extent[3]
                 words = f"frame {tile.title}" if tile.title.isdigit() else tile.title
                 axes.annotate(words[:22], place, (0, 2), textcoords="offset points", fontsize=6, ha="center")
         axes.set(xlim=(-_TILE_GAP, len(survey.tiles) + _TILE_GAP), ylim=(0, height), aspect="equal")
-
-
-def _extent(k: int, hw: Sequence[int], height: float) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of a map of size ``hw`` in the middle of the k-th cell of 1 x ``height``."""
-    half_width = (0.5 - _TILE_GAP) * min(1.0, height * hw[1] / hw[0])
-    half_height = half_width * hw[0] / hw[1]
-    return k + 0.5 - half_width, k + 0.5 + half_width, height / 2 - half_height, height / 2 + half_height
 
 
 def _depth_limits(depths: Tensor) -> tuple[float, float]:
@@ -486,37 +470,11 @@ def _depth_limits(depths: Tensor) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-3))
 
 
-def _draw_tile(
-    axes: Any, picture: Tensor, kind: str, limits: tuple[float, float], extent: tuple[float, float, float, float]
-) -> None:
-    step = max(1, max(picture.shape[-2:]) // 400)
-    if kind == "image":
-        pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
-        axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY_CMAP, extent=extent)
-    elif kind == "depth":
-        sparse = float((picture > 0).double().mean()) < _SPARSE_SHARE
-        shown = _nearest_per_block(picture, 3 * step) if sparse else picture[::step, ::step]
-        masked = np.ma.masked_equal(shown.numpy(), 0)
-        axes.imshow(masked, cmap=DEPTH_CMAP, vmin=limits[0], vmax=limits[1], extent=extent)
-        axes.add_patch(_make_outline(extent))
-    else:
-        pixels = picture[::step, ::step].numpy()
-        axes.imshow(pixels, cmap=SCORE_CMAP, vmin=0, vmax=2, interpolation="nearest", extent=extent)
-
-
 def _nearest_per_block(depth: Tensor, size: int) -> Tensor:
     """Nearest return in each block of ``size`` px, 0 without one: single sparse returns would be invisible."""
     negated = torch.where(depth > 0, -depth, -torch.inf)
     best = -torch.nn.functional.max_pool2d(negated[None], size, ceil_mode=True)[0]
     return torch.where(torch.isfinite(best), best, torch.zeros_like(best))
-
-
-def _make_outline(extent: tuple[float, float, float, float]) -> Any:
-    """Outline of a depth map, whose holes are white."""
-    from matplotlib.patches import Rectangle  # noqa: PLC0415
-
-    left, right, bottom, top = extent
-    return Rectangle((left, bottom), right - left, top - bottom, fill=False, edgecolor=UNANSWERED, linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:

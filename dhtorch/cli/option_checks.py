@@ -37,16 +37,6 @@ def _whole_number(low: int) -> _OptionRule:
     return (lambda v: _is_whole(v) and v >= low), f"a whole number of at least {low}"
 
 
-def _above_zero() -> _OptionRule:
-    """Rule: a positive number, infinity included."""
-    return (lambda v: _is_number(v) and v > 0), "a positive number"
-
-
-def _at_least_zero() -> _OptionRule:
-    """Rule: a number of at least 0."""
-    return (lambda v: _is_number(v) and v >= 0), "a number of at least 0"
-
-
 def _one_of(*known: Any) -> _OptionRule:
     """Rule: one of ``known``; True is not equal to 1."""
     names = [str(k).lower() if isinstance(k, bool) or k is None else str(k) for k in known]
@@ -59,10 +49,7 @@ def _or_null(rule: _OptionRule) -> _OptionRule:
 
 
 _TRUE_OR_FALSE = _one_of(True, False)
-_DENSE_OPTIONS: _OptionRule = (
-    (lambda v: v is None or isinstance(v, bool | Mapping)),
-    "true, false or options, e.g. {size: 320}",
-)
+_ABOVE_ZERO: _OptionRule = (lambda v: _is_number(v) and v > 0), "a positive number"  # infinity included
 
 #: Option of the command itself → its rule.
 _OPTION_RULES: dict[str, _OptionRule] = {
@@ -75,18 +62,24 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "device": ((lambda v: isinstance(v, str)), "a device that torch can use on this machine, e.g. cpu or cuda"),
     **dict.fromkeys(("figures", "points"), _one_of(True, False, "all")),
     **dict.fromkeys(("resume", "traceback", "arrays", "budget", "past"), _TRUE_OR_FALSE),
-    "cutoff": _or_null(_above_zero()),
-    "holdout.cutoff": _or_null(_above_zero()),
+    "cutoff": _or_null(_ABOVE_ZERO),
+    "holdout.cutoff": _or_null(_ABOVE_ZERO),
     "holdout.truth": _one_of("raw", "5x5", "full"),
     "poses": _one_of("auto", "device", "anchored"),
-    "voxel": _or_null(_above_zero()),
-    "truncation": _or_null(_above_zero()),
-    **dict.fromkeys(("sensor_sigma_m", "sensor_sigma_rel", "min_weight"), _at_least_zero()),
+    "voxel": _or_null(_ABOVE_ZERO),
+    "truncation": _or_null(_ABOVE_ZERO),
+    **dict.fromkeys(
+        ("sensor_sigma_m", "sensor_sigma_rel", "min_weight"),
+        ((lambda v: _is_number(v) and v >= 0), "a number of at least 0"),
+    ),
     "min_conf": _whole_number(0),
     "min_maps": _whole_number(1),
     "weight": _one_of("variance", "confidence"),
     "mesh": _or_null(_TRUE_OR_FALSE),
-    "dense": _DENSE_OPTIONS,
+    "dense": (
+        (lambda v: v is None or isinstance(v, bool | Mapping)),
+        "true, false or options, e.g. {size: 320}",
+    ),
     "max_frames": _or_null(_whole_number(1)),
     "every": _whole_number(1),
     "source_views": _whole_number(1),
@@ -94,14 +87,20 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "size": _whole_number(8),
     "refinements": _whole_number(0),
     "min_correlation": ((lambda v: _is_number(v) and -1 <= v <= 1), "a number from -1 to 1"),
-    "max_sigma_rel": _above_zero(),
-    "unit": _or_null(_above_zero()),
-    "minutes": _or_null(_above_zero()),
+    "max_sigma_rel": _ABOVE_ZERO,
+    "unit": _or_null(_ABOVE_ZERO),
+    "minutes": _or_null(_ABOVE_ZERO),
     "recordings": _or_null(_whole_number(1)),
+    "ref_frames": _or_null(_whole_number(1)),
+    **dict.fromkeys(("window", "pictures"), _whole_number(0)),
+    "shard_rows": _whole_number(1),
+    **dict.fromkeys(("causal", "report", "cameras"), _TRUE_OR_FALSE),
+    "gap": ((lambda v: v == "auto" or (_is_whole(v) and v >= 0)), "a whole number of at least 0"),
+    "step": ((lambda v: _is_number(v) and 0 <= v <= 1), "a number from 0 to 1"),
+    "fps": ((lambda v: v is None or (_is_number(v) and 1e-4 <= v <= 1e4)), "a number from 0.0001 to 10000"),
 }
 
 #: Numeric parameters of functions by name: counts (at least 1), and those that must not be negative.
-_COUNT_NAMES: tuple[str, ...]
 _COUNT_NAMES = (
     "n",
     "hypotheses",
@@ -114,8 +113,8 @@ _COUNT_NAMES = (
     "window",
     "block",
     "patch",
+    *("steps", "hw", "depth_hw", "tokens_hw", "tokens", "shard_rows", "long", "stack"),
 )
-_COUNT_NAMES += ("steps", "hw", "depth_hw", "tokens_hw", "tokens", "shard_rows", "long", "stack")
 _NONNEGATIVE_NAMES = re.compile(
     r".*_(px|m|rel|hz)|(min|max|sigma)_.*|metres|seconds|tolerance|foveation|near|range_limit|window"
 )
@@ -296,6 +295,17 @@ def validate_values(settings: Mapping[str, Any], like: Mapping[str, Any] | None 
             raise ValueError(f"{name}: found nan, expected a number")
         if isinstance(value, Mapping):
             validate_values(value, default if isinstance(default, Mapping) else None, f"{name}.")
+
+
+def validate_choices(settings: Mapping[str, Any], choices_of: Mapping[str, Iterable[Any]]) -> None:
+    """Reject values of options, by name, that are none of their choices.
+
+    Raises:
+        ValueError: names the option, the value found and the choices.
+    """
+    for name, choices in choices_of.items():
+        if settings[name] not in choices:
+            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(map(str, choices))}")
 
 
 def _check_value(name: str, value: Any, hint: Any) -> None:

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.cli.pin_words import describe_pin, guide_pin
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.codes import PinReason, PinVerdict, name
 from dhtorch.data import open_all
@@ -26,6 +25,7 @@ from dhtorch.data.intrinsics import MissingIntrinsicsError, parse_intrinsics
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.export import encode_png
+from dhtorch.geometry import se3
 from dhtorch.measure.change_points import ChangePoint, find_change_points
 from dhtorch.measure.pin import CameraPin
 from dhtorch.pytree import collate
@@ -107,13 +107,19 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         episodes = []
         for episode in _compare(pin, settings, camera_name, progress):
             episodes.append(episode)
-            print(_format_episode(episode))
+            # The printed line of an episode: that of its middle picture, and its changes
+            n = len(episode.numbers)
+            known = int((episode.result.verdict != PinVerdict.CANNOT_KNOW).sum())
+            counted = "" if n == 1 else f" ({known} of {format_count(n, 'picture')} known)"
+            changes = "".join(
+                f"; from frame {episode.numbers[c.first]} by {c.shift_px:.1f} px" for c in episode.changes
+            )
+            print(f"{episode.name}: {describe_pin(episode.middle)}{counted}{changes}")
         summary = _summarise(episodes)
         exceeded = list_exceeded_limits(summary, limits, _PIN_LIMITS)
-        rows = [_row_of(episode) for episode in episodes]
         content = {"ref": str(settings["ref"]), "source": str(settings["source"]), "metric": pin.metric}
         content |= {"false_alarm_rate": rate, "notes": pin.notes, "fail_on": settings["fail_on"]}
-        content |= {"exceeded": exceeded, "whole": summary, "episodes": rows}
+        content |= {"exceeded": exceeded, "whole": summary, "episodes": list(map(_row_of, episodes))}
         storage.write_json(folder / "pin.json", storage.to_strict_json(content))
         _write_pages(folder, pin, episodes, summary, exceeded, settings)
     print("\n".join([*(f"exceeded: {line}" for line in exceeded), f"Wrote pin.json, pin.html in {folder}."]))
@@ -128,7 +134,14 @@ def _read_reference(settings: Mapping[str, Any]) -> tuple[Frame, str | None]:
     path = Path(str(settings["ref"])).expanduser()
     if path.suffix.lower() in _PICTURE_SUFFIXES:
         image = torch.from_numpy(files.read_image(path))[None]
-        return Frame(image, torch.zeros(1, *image.shape[-2:]), _stated_camera(path, image, settings["data"])), None
+        # Intrinsics of a single picture: those of the options, else of an assumed field of view
+        stated, hw = settings["data"], (image.shape[-2], image.shape[-1])
+        options = {key: stated[key] for key in ("intrinsics", "K", "fov") if stated[key] is not None}
+        K = parse_intrinsics(path, hw, **(options or {"fov": _ASSUMED_FOV_DEG})).K
+        if K is None:
+            raise ValueError(f"data.intrinsics: found {stated['intrinsics']!r}, expected fx,fy,cx,cy or degrees")
+        numbers = torch.tensor([K], dtype=torch.float32)
+        return Frame(image, torch.zeros(1, *hw), Camera(numbers[:, :2], numbers[:, 2:])), None
     recording = _open(path, settings)[0]
     frames = [recording[k] for k in _spread(len(recording), settings["ref_frames"])]
     if 0 in frames[0].hw:
@@ -149,20 +162,8 @@ def _open(path: Path, settings: Mapping[str, Any]) -> Sequence[Recording]:
         return open_all(path, settings["format"], **{**options, "fov": _ASSUMED_FOV_DEG})
 
 
-def _stated_camera(path: Path, image: Tensor, stated: Mapping[str, Any]) -> Camera:
-    """Intrinsics of a single picture: those of the options, else of an assumed field of view."""
-    options = {key: stated[key] for key in ("intrinsics", "K", "fov") if stated[key] is not None}
-    K = parse_intrinsics(path, (image.shape[-2], image.shape[-1]), **(options or {"fov": _ASSUMED_FOV_DEG})).K
-    if K is None:
-        raise ValueError(f"data.intrinsics: found {stated['intrinsics']!r}, expected fx,fy,cx,cy or degrees")
-    numbers = torch.tensor([K], dtype=torch.float32)
-    return Camera(numbers[:, :2], numbers[:, 2:])
-
-
 def _spread(n: int, wanted: int | None) -> list[int]:
     """Positions of ``wanted`` of n frames, evenly spread; all where None or more than n; the first where 1."""
-    if wanted is not None and wanted < 1:
-        raise ValueError(f"max_frames: found {wanted}, expected at least 1, or null for all")
     if wanted is None or wanted >= n:
         return list(range(n))
     return [k * n // wanted for k in range(wanted)]
@@ -174,11 +175,21 @@ def _spread(n: int, wanted: int | None) -> list[int]:
 def _compare(
     pin: CameraPin, settings: Mapping[str, Any], camera_name: str | None, progress: Progress
 ) -> Iterator[Episode]:
-    """The episodes of the source, one by one."""
+    """The episodes of the source, one by one: of a live camera until ``max_frames`` or its end, each picture with its
+    line."""
     source = str(settings["source"])
     path = Path(source).expanduser()
     if source.isdigit():
-        yield _compare_live(pin, int(source), settings)
+        numbers = itertools.count()
+
+        def report(result: PinResult) -> None:
+            lines = guide_pin(result) if settings["guide"] else [describe_pin(result)]
+            print(f"{next(numbers)}: {'   '.join(lines)}", flush=True)
+
+        live = itertools.islice(files.read_live_camera(int(source)), settings["max_frames"])
+        images = (torch.from_numpy(picture) for picture in live)
+        episode = _compare_pictures(pin, f"camera {source}", images, settings["device"], report)
+        yield Episode(f"camera {source}", list(range(len(episode[0].verdict))), *episode)
     elif path.suffix.lower() in _PICTURE_SUFFIXES:
         image = torch.from_numpy(files.read_image(path))
         result = pin.check(image.to(settings["device"]))
@@ -216,21 +227,6 @@ def _compare_pictures(
         raise ValueError(f"{title}: found no picture, expected at least one")
     result = collate(results)
     return result, worst, find_change_points(result, false_alarm_rate=pin.false_alarm_rate)
-
-
-def _compare_live(pin: CameraPin, index: int, settings: Mapping[str, Any]) -> Episode:
-    """Pictures of a live camera, each with its line, until ``max_frames`` or the end of the camera."""
-
-    numbers = itertools.count()
-
-    def report(result: PinResult) -> None:
-        lines = guide_pin(result) if settings["guide"] else [describe_pin(result)]
-        print(f"{next(numbers)}: {'   '.join(lines)}", flush=True)
-
-    pictures = itertools.islice(files.read_live_camera(index), settings["max_frames"])
-    images = (torch.from_numpy(picture) for picture in pictures)
-    result, worst, changes = _compare_pictures(pin, f"camera {index}", images, settings["device"], report)
-    return Episode(f"camera {index}", list(range(len(result.verdict))), result, worst, changes)
 
 
 # ------------------------------------------------------------------------------------------------------------- results
@@ -278,15 +274,6 @@ def _row_of(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _format_episode(episode: Episode) -> str:
-    """The printed line of an episode: that of its middle picture, and its changes."""
-    n = len(episode.numbers)
-    known = int((episode.result.verdict != PinVerdict.CANNOT_KNOW).sum())
-    counted = "" if n == 1 else f" ({known} of {format_count(n, 'picture')} known)"
-    changes = "".join(f"; from frame {episode.numbers[c.first]} by {c.shift_px:.1f} px" for c in episode.changes)
-    return f"{episode.name}: {describe_pin(episode.middle)}{counted}{changes}"
-
-
 def _write_pages(
     folder: Path,
     pin: CameraPin,
@@ -320,3 +307,54 @@ def _to_rgb(image: Tensor) -> np.ndarray:
     pixels = image.detach().cpu()
     pixels = (pixels * 255).round() if pixels.is_floating_point() else pixels
     return pixels.to(torch.uint8).expand(3, -1, -1).permute(1, 2, 0).numpy()
+
+
+# ------------------------------------------------------------------------------------------------------------ in words
+
+#: Distance and angle below which the guide calls a mount in place, mm and degrees: the median error of a half hidden
+#: picture allowed for. Source: the required accuracy of the offset.
+IN_PLACE_MM, IN_PLACE_DEG = 2.0, 0.1
+
+#: Ways of the guide along and about the camera's axes (x right, y down, z forward): negative, positive.
+_SHIFTS = (("← left", "→ right"), ("↑ up", "↓ down"), ("⊙ back", "⊗ forward"))
+_TURNS = (("⤓ tilt down", "⤒ tilt up"), ("↶ turn left", "↷ turn right"), ("⟲ roll left", "⟳ roll right"))
+
+
+def describe_pin(result: PinResult) -> str:
+    """One picture's result (1) in a line: verdict, shift, offset with standard deviations, or the reason for none."""
+    verdict = name(PinVerdict, int(result.verdict)).lower().replace("_", " ")
+    if int(result.verdict) == PinVerdict.CANNOT_KNOW:
+        text = f"{verdict}: {PinReason.entries[int(result.reason)].definition}"
+        focal = f" ({float(result.zoom):.4f} ± {float(result.zoom_sigma):.4f} of the stated one)"
+        return text + focal if int(result.reason) == PinReason.ZOOM else text
+    sigma = result.cov[0].diagonal().clamp_min(0).sqrt()
+    turn, shift = result.offset[0].split(3)
+    angle = math.degrees(float(turn.norm()))
+    angle_sigma = math.degrees(float(sigma[:3].norm()))
+    px = f"{verdict}, {float(result.shift_px):.2f} ± {float(result.shift_sigma_px):.2f} px"
+    text = f"{px}, turned by {angle:.3f} ± {angle_sigma:.3f}°"
+    if bool(result.metric):
+        return f"{text}, displaced by {1e3 * float(shift.norm()):.1f} ± {1e3 * float(sigma[3:].norm()):.1f} mm"
+    if float(shift.norm()) > 0:
+        return f"{text}, displaced along ({', '.join(f'{x:.2f}' for x in shift.tolist())}) by an unknown length"
+    return f"{text} (reference without depth: no length)"
+
+
+def guide_pin(result: PinResult) -> list[str]:
+    """One picture's result (1) -> lines that say how to put the camera back: arrows, mm and degrees.
+
+    Directions are those of the live camera: right, down and forward in its own picture.
+    """
+    if int(result.verdict) == PinVerdict.CANNOT_KNOW:
+        return [describe_pin(result)]
+    back = se3.invert(result.T_ref_from_live)  # the reference camera seen from the live one
+    turn = [math.degrees(x) for x in se3.log(back)[0, :3].tolist()]
+    shift = [1e3 * x for x in back.t[0].tolist()]
+    lines = []
+    if bool(result.metric):
+        lines += [f"{_SHIFTS[k][x > 0]} {abs(x):.1f} mm" for k, x in enumerate(shift) if abs(x) >= IN_PLACE_MM]
+    elif any(shift):
+        k = max(range(3), key=lambda k: abs(shift[k]))
+        lines.append(f"mainly {_SHIFTS[k][shift[k] > 0]}, by an unknown length")
+    lines += [f"{_TURNS[k][x > 0]} {abs(x):.2f}°" for k, x in enumerate(turn) if abs(x) >= IN_PLACE_DEG]
+    return [*(lines or ["in place"]), f"shift {float(result.shift_px):.1f} ± {float(result.shift_sigma_px):.1f} px"]

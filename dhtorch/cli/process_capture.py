@@ -9,44 +9,50 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import io
 import math
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from dhtorch import export
-from dhtorch.cli import complete, recover_page, recover_pictures
+from dhtorch.cli import complete, recover_page
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.capture_checks import describe_missing_depth, print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, describe_pictures, find_captures
-from dhtorch.cli.recover_pictures import CONTACT_SHEET, PREVIEW_VIDEO
 from dhtorch.data import FORMATS, FormatError, open_all
 from dhtorch.data.foreign_files import describe_layout
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.export import video
 from dhtorch.geometry import se3
 from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
 from dhtorch.integrate.mapping import choose_voxel, file_from_world, should_mesh, surface_shape, write_surface
 from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Pose
+from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
-from dhtorch.validation.capture_check import CaptureCheck, check_capture
-from dhtorch.viz.plots import format_capture_name
+from dhtorch.validation.capture_check import check_capture
+from dhtorch.viz.plots import (
+    CompletedView,
+    Strip,
+    append_cutoff,
+    draw_contact_sheet,
+    fit_common_depth_axis,
+    format_capture_name,
+)
 from dhtorch.viz.viewer import html, points
 from dhtorch.viz.viewer.exhibit import PageOpening
-
-#: Default output folder.
-_DEFAULT_FOLDER = Path("dhtorch_out")
 
 #: Maximum number of frames in the fused map; evenly spread, further frames show the same surfaces.
 _MAX_MAPPED_FRAMES = 40
@@ -67,19 +73,24 @@ _COMPLETE_DEFAULTS = {
     "every": 1,
 }
 
+#: Names of the files.
+CONTACT_SHEET, PREVIEW_VIDEO = "overview.png", "preview.mp4"
 
-#: Suggested cutoff where no completed frame has a return, m. Source: origin not recorded.
-_DEFAULT_CUTOFF_M = 2.0
+#: Frames of the contact sheet: beginning, middle and end of the capture.
+_SHEET_FRAMES = 3
+
+#: Maximum number of frames of the moving preview, evenly spread. Source: derived: 20 s at the largest rate.
+_MAX_VIDEO_FRAMES = 200
+
+#: Frames whose depths determine the scale of the moving preview. Bounds the memory.
+_SCALE_FRAMES = 12
+
+#: Frames per second of the moving preview, and the seconds that a short one lasts. Source: chosen for the eye.
+_MIN_FPS, _MAX_FPS, _VIDEO_SECONDS = 2, 10, 8
+
 
 #: Files written beside those of ``dhtorch complete``.
 _FURTHER_FILES = (CONTACT_SHEET, PREVIEW_VIDEO, "map.ply", "map.glb", "view.html")
-
-
-class FoundRecording(NamedTuple):
-    """A recording and the path at which it is opened."""
-
-    path: Path
-    recording: Recording
 
 
 class NothingToRecover(ValueError):
@@ -114,11 +125,35 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     captures = [
         replace(capture, options=reader_options) for capture in find_recording_captures(path, settings["format"])
     ]
-    out = _resolve_folder(path, settings["out"])
-    recordings, refused = _open_captures(captures)
-    chosen: Sequence[FoundRecording] = recordings[: settings["recordings"]]
+    name = path.stem if path.is_file() else path.resolve().name or "capture"
+    out = Path("dhtorch_out", name) if settings["out"] is None else Path(str(settings["out"])).expanduser()
+    if path.is_dir() and out.resolve().is_relative_to(path.resolve()):
+        expected = "which is never written to; expected another folder (out=DIR)"
+        raise ValueError(f"out: {out} is inside the capture, {expected}")
+    recordings: list[tuple[Path, Recording]] = []
+    refused: list[str] = []  # reasons
+    for capture in captures:
+        try:
+            recordings += [(capture.path, recording) for recording in _open_capture(capture)]
+        except (NothingToRecover, FormatError) as error:
+            if len(captures) == 1:
+                raise
+            refused.append(str(error))
+    chosen = recordings[: settings["recordings"]]
+    start, n_done = time.monotonic(), 0
     with open_output_folder(out, "out") if len(chosen) > 1 else contextlib.nullcontext():
-        n_done = _process_recordings(chosen, out, settings, parts["method"], refused, progress)
+        for n, (place, recording) in enumerate(chosen):
+            minutes = settings["minutes"]
+            until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
+            folder = out if len(chosen) == 1 else out / recording.name
+            own = {**settings, "path": place}
+            try:
+                lines = _process_recording(recording, folder, own, parts["method"], until, progress)
+            except NothingToRecover as nothing:
+                refused.append(str(nothing))
+                continue
+            n_done += 1
+            print("\n".join(lines), flush=True)
     if n_done == 0:
         raise NothingToRecover("; ".join(refused[:3]))
     for line in refused:
@@ -126,31 +161,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if len(chosen) < len(recordings):
         print(f"{len(chosen)} of {len(recordings)} recordings done; recordings=null does all")
     return 0
-
-
-def _process_recordings(
-    chosen: Sequence[FoundRecording],
-    out: Path,
-    settings: Mapping[str, Any],
-    method: Method,
-    refused: list[str],
-    progress: Progress,
-) -> int:
-    """Complete the recordings one by one and print their summaries -> their number; reasons of the others are added to
-    ``refused``."""
-    start, n_done = time.monotonic(), 0
-    for n, (path, recording) in enumerate(chosen):
-        minutes = settings["minutes"]
-        until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
-        folder = out if len(chosen) == 1 else out / recording.name
-        try:
-            lines = _process_recording(recording, folder, {**settings, "path": path}, method, until, progress)
-        except NothingToRecover as nothing:
-            refused.append(str(nothing))
-            continue
-        n_done += 1
-        print("\n".join(lines), flush=True)
-    return n_done
 
 
 # --------------------------------------------------------------------------------------------------------------- input
@@ -173,24 +183,6 @@ def find_recording_captures(path: Path, format: str = "auto") -> list[FoundCaptu
         what = f"focal stacks ({captures[0].format}) of a still camera"
         raise NothingToRecover(f"{path}: {what}; images from two positions and depth of near surfaces are required")
     raise NothingToRecover(f"{path}: {describe_pictures(path, captures)}")
-
-
-def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[FoundRecording], list[str]]:
-    """The recordings of several captures, and an error message for each capture that cannot be opened.
-
-    Raises:
-        NothingToRecover, FormatError: the only capture cannot be opened.
-    """
-    recordings: list[FoundRecording] = []
-    refused: list[str] = []
-    for capture in captures:
-        try:
-            recordings += [FoundRecording(capture.path, recording) for recording in _open_capture(capture)]
-        except (NothingToRecover, FormatError) as error:
-            if len(captures) == 1:
-                raise
-            refused.append(str(error))
-    return recordings, refused
 
 
 def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
@@ -224,21 +216,6 @@ def order_evenly(n: int) -> list[int]:
     bits = max(n - 1, 0).bit_length()
     sequence = (int(f"{k:0{bits}b}"[::-1], 2) * n >> bits for k in range(1 << bits)) if bits else range(n)
     return list(dict.fromkeys([n // 2, 0, n - 1, *sequence] if n else []))
-
-
-def _resolve_folder(path: Path, out: Any) -> Path:
-    """The output folder.
-
-    Raises:
-        ValueError: it is inside the capture.
-    """
-    name = path.resolve().name or "capture"
-    folder = _DEFAULT_FOLDER / (path.stem if path.is_file() else name) if out is None else Path(str(out)).expanduser()
-    if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
-        raise ValueError(
-            f"out: {folder} is inside the capture, which is never written to; expected another folder (out=DIR)"
-        )
-    return folder
 
 
 def _find_usable_frame(recording: Recording) -> int:
@@ -302,32 +279,24 @@ def _process_recording(
     order = order[: settings["max_frames"]]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     with completed.open_task_folder(task, _FURTHER_FILES):
-        return _recover_task(task, check, until, settings, progress)
-
-
-def _recover_task(
-    task: CompletionTask, check: CaptureCheck, until: float | None, settings: Mapping[str, Any], progress: Progress
-) -> list[str]:
-    """Complete the frames of a task and write the map and the page -> the printed lines."""
-    recording, folder = task.recording, task.folder
-    recovered = _complete_in_time(task, until, progress)
-    if not recovered.frames:
-        reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")
-        raise NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
-    stats = recover_page.measure_recovery(task, recovered.frames)
-    placed = _place_frames(recovered)
-    lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
-    lines += recover_page.describe_placing(check, recording, placed)
-    opening = recover_page.build_opening(
-        [*recover_page.describe_check(check), *lines],
-        stats,
-        *recover_pictures.write_overview(task, recovered.frames),
-    )
-    written = _write_map(recovered, placed, opening, settings, progress)
-    recover_pictures.write_moving_preview(task, recovered.frames, progress)
-    shown = written[-1] if written else CONTACT_SHEET
-    written = ["depth/", "previews/", CONTACT_SHEET, PREVIEW_VIDEO, *written]
-    return [*lines, _format_next_step(recovered, shown), f"Wrote {', '.join(written)} in {folder}."]
+        recovered = _complete_in_time(task, until, progress)
+        if not recovered.frames:
+            reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")
+            raise NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
+        stats = recover_page.measure_recovery(task, recovered.frames)
+        placed = _place_frames(recovered)
+        lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
+        lines += recover_page.describe_placing(check, recording, placed)
+        opening = recover_page.build_opening(
+            [*recover_page.describe_check(check), *lines],
+            stats,
+            *write_overview(task, recovered.frames),
+        )
+        written = _write_map(recovered, placed, opening, settings, progress)
+        write_moving_preview(task, recovered.frames, progress)
+        shown = written[-1] if written else CONTACT_SHEET
+        written = ["depth/", "previews/", CONTACT_SHEET, PREVIEW_VIDEO, *written]
+        return [*lines, _format_next_step(recovered, shown), f"Wrote {', '.join(written)} in {folder}."]
 
 
 def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> RecoveredFrames:
@@ -344,16 +313,12 @@ def _complete_in_time(task: CompletionTask, until: float | None, progress: Progr
                 return
             yield i
 
+    left = "" if until is None else f" (at most {max(0.0, until - time.monotonic()) / 60:.1f} min)"
     with complete.close_on_exit(task):
-        for i in progress(in_time(), f"{task.scene.name}: frames{_format_limit(until)}", len(todo)):
+        for i in progress(in_time(), f"{task.scene.name}: frames{left}", len(todo)):
             if _try_frame(recovered, i) and len(recovered.frames) == 1:
-                recover_pictures.write_overview(task, recovered.frames)
+                write_overview(task, recovered.frames)
     return recovered
-
-
-def _format_limit(until: float | None) -> str:
-    """The time left until a limit, for the progress bar; empty without one."""
-    return "" if until is None else f" (at most {max(0.0, until - time.monotonic()) / 60:.1f} min)"
 
 
 def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
@@ -364,7 +329,12 @@ def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
             complete.complete_frame(task, i)
         except FormatError:
             candidates: Any = task.offers.get(i, ())
-            broken = {k: error for k in (i, *candidates) if (error := _read_error(task.recording, k))}
+            broken: dict[int, str] = {}
+            for k in (i, *candidates):
+                try:
+                    task.recording[k]
+                except FormatError as error:
+                    broken[k] = str(error)
             if not broken:
                 raise
             recovered.broken.update(broken)
@@ -374,14 +344,6 @@ def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
             recovered.frames.append(i)
             return True
     return False
-
-
-def _read_error(recording: Recording, k: int) -> str:
-    try:
-        recording[k]
-    except FormatError as error:
-        return str(error)
-    return ""
 
 
 def _place_frames(recovered: RecoveredFrames) -> Recording:
@@ -439,46 +401,78 @@ def _write_map(
     return ["map.ply", "map.glb", "view.html"]
 
 
+# ------------------------------------------------------------------------------------------------------------ images
+
+
+def write_overview(task: CompletionTask, frames: Sequence[int]) -> tuple[bytes, str]:
+    """Write the contact sheet of evenly spread complete frames -> its PNG and a caption."""
+    shown = _pick_evenly(sorted(frames), _SHEET_FRAMES)
+    views = [_read_view(task, i) for i in shown]
+    out = io.BytesIO()
+    name, cutoff = format_capture_name(task.scene.name), task.settings["cutoff"]
+    title = append_cutoff(f"{name}, {format_count(len(frames), 'frame')} completed", cutoff)
+    draw_contact_sheet(out, views, title=title)
+    storage.replace_file(task.folder / CONTACT_SHEET, out.getvalue())
+    numbers = ", ".join(str(task.done[task.name(i)]["frame"]) for i in shown)
+    place = append_cutoff(f"{name}, frame{'s' * (len(shown) > 1)} {numbers}", cutoff)
+    panels = "picture, sensor depth and completed depth on one scale in metres, and sigma / depth"
+    return out.getvalue(), f"{place}: {panels}."
+
+
+def write_moving_preview(task: CompletionTask, frames: Sequence[int], progress: Progress) -> None:
+    """Write the moving preview of complete frames, in their order in the capture: picture, sensor, completed."""
+    shown = _pick_evenly(sorted(frames), _MAX_VIDEO_FRAMES)
+    scale_views = [_read_view(task, i) for i in _pick_evenly(shown, _SCALE_FRAMES)]
+    hw = np.asarray(scale_views[0].depth).shape
+    title = append_cutoff(format_capture_name(task.scene.name), task.settings["cutoff"])
+    strip = Strip(title, (hw[0], hw[1]), fit_common_depth_axis(scale_views))
+    fps = min(_MAX_FPS, max(_MIN_FPS, round(len(shown) / _VIDEO_SECONDS)))
+    loop = progress(shown, f"{task.scene.name}: preview", len(shown))
+    images = (strip.render(_read_view(task, i)) for i in loop)
+    video.write_preview_video(task.folder / PREVIEW_VIDEO, strip.picture_hw, images, fps)
+
+
+def _read_view(task: CompletionTask, i: int) -> CompletedView:
+    maps, source = completed.read_completed_maps(task, i)
+    picture = np.atleast_3d(complete.resize_picture(task.recording[i], source.shape)).transpose(2, 0, 1)
+    return CompletedView(f"Frame {task.done[task.name(i)]['frame']}", picture, maps["depth"], maps["sigma"], source)
+
+
+def _pick_evenly(frames: Sequence[int], n: int) -> list[int]:
+    """``n`` of the frames at most, each from the middle of its part of them."""
+    n = min(n, len(frames))
+    return [frames[int((k + 0.5) * len(frames) / n)] for k in range(n)]
+
+
 # ------------------------------------------------------------------------------------------------------------ summary
 
 
 def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
     """The printed next step; ``shown`` is the file to open."""
-    n, name = len(recovered.broken), recovered.task.scene.name
+    task, n = recovered.task, len(recovered.broken)
+    settings = task.settings
     cause = next(iter(recovered.broken.values()), "")
-    broken = f"\n{format_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
-    if recovered.left:
-        left = f"{recovered.left} of {format_count(len(recovered.task.frames), 'frame')} left at the time limit"
-        return f"Next: open {shown}; {left}, to complete them: {_format_same_command(recovered)}{broken}"
-    return f"Next: open {shown}; to measure the error on your capture: {_format_run_command(recovered)}{broken}"
-
-
-def _format_same_command(recovered: RecoveredFrames) -> str:
-    """The command as typed, without its time limit."""
-    typed = recovered.task.settings["typed"]
-    return shlex.join(["dhtorch", *(word for word in typed if not word.startswith("minutes=")), "--minutes", "null"])
-
-
-def _format_run_command(recovered: RecoveredFrames) -> str:
-    """The command that measures the error on a capture: the same reader options, a cutoff among its returns."""
-    settings = recovered.task.settings
+    broken = f"\n{format_count(n, 'frame')} of {task.scene.name} could not be read ({cause})." if n else ""
+    if recovered.left:  # the command as typed, without its time limit
+        typed = [word for word in settings["typed"] if not word.startswith("minutes=")]
+        left = f"{recovered.left} of {format_count(len(task.frames), 'frame')} left at the time limit"
+        command = shlex.join(["dhtorch", *typed, "--minutes", "null"])
+        return f"Next: open {shown}; {left}, to complete them: {command}{broken}"
+    # The command that measures the error: the same reader options, a cutoff beyond which half of the returns lie
     reader = {name: value for name, value in settings["data"].items() if name not in ("path", "format")}
     if settings["reader_format"] != "auto":
         reader["format"] = settings["reader_format"]
     words = [f"data.{name}={_format_value(value)}" for name, value in reader.items() if value is not None]
-    return shlex.join(["dhtorch", "run", str(settings["path"]), *words, "--cutoff", f"{_choose_cutoff(recovered):g}"])
+    cutoff = 2.0  # m, where no completed frame has a return
+    median = recover_page.measure_median_return(task, recovered.frames)
+    if median is not None:  # rounded up to two digits
+        step = 10.0 ** (math.floor(math.log10(median)) - 1)
+        cutoff = math.ceil(median / step - 1e-9) * step
+    command = shlex.join(["dhtorch", "run", str(settings["path"]), *words, "--cutoff", f"{cutoff:g}"])
+    return f"Next: open {shown}; to measure the error on your capture: {command}{broken}"
 
 
 def _format_value(value: Any) -> str:
     """A value as written on the command line."""
     listed = isinstance(value, list)
     return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _choose_cutoff(recovered: RecoveredFrames) -> float:
-    """Median return depth over some frames, m, rounded up to two digits: half of the returns lie beyond it."""
-    median = recover_page.measure_median_return(recovered.task, recovered.frames)
-    if median is None:
-        return _DEFAULT_CUTOFF_M
-    step = 10.0 ** (math.floor(math.log10(median)) - 1)
-    return math.ceil(median / step - 1e-9) * step

@@ -11,7 +11,7 @@ import numpy as np
 
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import gate_messages as reasons
-from dhtorch.cli.completed_folder import CompletionTask, Row
+from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.codes import SOURCES_OF_KIND, Source, is_recovered, words
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.recording import Recording
@@ -24,7 +24,7 @@ from dhtorch.viz.viewer.exhibit import PageOpening
 #: Maximum number of frames read for depth range and stated error; further frames show the same surfaces.
 _MAX_MEASURED_FRAMES = 40
 
-#: Frames whose returns determine the median return. Source: origin not recorded; bounds the time of the summary.
+#: Frames whose returns determine the median return. They bound the time of the summary.
 _RETURN_FRAMES = 8
 
 #: Ratio of baseline to depth, and of that ratio to the angle of rotation in rad, below which stated poses have too
@@ -67,13 +67,23 @@ def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoverySta
     counts = [completed.count_pixels(row) for row in rows]
     fractions = {kind: float(np.mean([n[kind] / sum(n.values()) for n in counts])) for kind in SOURCES_OF_KIND}
     pixels = {kind: sum(n[kind] for n in counts) / len(counts) for kind in SOURCES_OF_KIND}
-    reasons = tuple(sorted(_average_no_answer_shares(rows).items(), key=lambda item: -item[1]))
+    average: dict[str, float] = {}  # fraction of unanswered pixels by reason
+    for row in rows:
+        for name, share in row["no_answer"].items():
+            average[name] = average.get(name, 0.0) + share / len(rows)
+    reasons = tuple(sorted(average.items(), key=lambda item: -item[1]))
     stats = RecoveryStats(len(rows), fractions, pixels, reasons)
-    depth, ratio = _read_recovered_pixels(task, frames)
+    depths, ratios = [], []
+    for i in frames[:_MAX_MEASURED_FRAMES]:
+        maps, source = completed.read_completed_maps(task, i)
+        recovered = is_recovered(source) & (maps["depth"] > 0)
+        depths.append(maps["depth"][recovered])
+        ratios.append(maps["sigma"][recovered] / maps["depth"][recovered])
+    depth = np.concatenate(depths)
     if not len(depth):
         return replace(stats, motion=_measure_stated_motion(task, frames))
     near, far = np.percentile(depth, (2, 98)).tolist()
-    return replace(stats, near=near, far=far, error=float(np.median(ratio)))
+    return replace(stats, near=near, far=far, error=float(np.median(np.concatenate(ratios))))
 
 
 def measure_median_return(task: CompletionTask, frames: Sequence[int]) -> float | None:
@@ -103,26 +113,6 @@ def _measure_stated_motion(task: CompletionTask, frames: Sequence[int]) -> State
         return None
     baseline, turn = np.median(motions, 0).tolist()
     return StatedMotion(baseline, turn, depth)
-
-
-def _read_recovered_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and sigma / depth of the recovered pixels of the first ``_MAX_MEASURED_FRAMES`` frames."""
-    depth, ratio = [np.zeros(0)], [np.zeros(0)]
-    for i in frames[:_MAX_MEASURED_FRAMES]:
-        maps, source = completed.read_completed_maps(task, i)
-        recovered = is_recovered(source) & (maps["depth"] > 0)
-        depth.append(maps["depth"][recovered])
-        ratio.append(maps["sigma"][recovered] / maps["depth"][recovered])
-    return np.concatenate(depth), np.concatenate(ratio)
-
-
-def _average_no_answer_shares(rows: Sequence[Row]) -> dict[str, float]:
-    """Mean fraction of unanswered pixels by reason."""
-    shares: dict[str, float] = {}
-    for row in rows:
-        for name, share in row["no_answer"].items():
-            shares[name] = shares.get(name, 0.0) + share / len(rows)
-    return shares
 
 
 def describe_recovery(

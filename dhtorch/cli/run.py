@@ -17,22 +17,26 @@ import multiprocessing
 import os
 import re
 import shlex
+import shutil
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import dhtorch
-from dhtorch.cli import commands, errors, signals
+from dhtorch.cli import commands
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together
 from dhtorch.cli.option_checks import quote_value
 from dhtorch.runtime import console, parent_watch
 from dhtorch.runtime.allocator import disable_malloc_trim
-from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
+from dhtorch.runtime.output_folder import open_output_folder
 
 #: Sub-command → module with ``main(argv) -> int``.
 _PARSED_COMMANDS = {
@@ -119,6 +123,9 @@ _MAX_CAPTURES_SHOWN = 4
 
 _SEPARATORS = "/\\"
 
+#: The option that shows tracebacks, as typed.
+_TRACEBACK_OPTION = re.compile(r"(--)?traceback(=true)?")
+
 #: End of a word that is the name of a file.
 _FILE_END = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")
 
@@ -132,14 +139,12 @@ _MAX_NAME_LENGTH = 120
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    flags, argv = (
-        [a for a in argv if a in console.VERBOSITY_FLAGS],
-        [a for a in argv if a not in console.VERBOSITY_FLAGS],
-    )
+    flags = [a for a in argv if a in console.VERBOSITY_FLAGS]
+    argv = [a for a in argv if a not in flags]
     with console.escape_output(), console.set_verbosity(flags), console.show_warnings_in_a_line():
-        with signals.catch_termination() as received:
+        with catch_termination() as received:
             code = _run_guarded(argv)
-        return received.code(code)
+        return 128 + received[0] if received else code  # as a shell reports it
 
 
 def _run_guarded(argv: list[str]) -> int:
@@ -151,12 +156,10 @@ def _run_guarded(argv: list[str]) -> int:
     except BrokenPipeError:  # as of `dhtorch report … | head`
         console.discard_broken_pipe()
         return EXIT_BROKEN_PIPE
-    except errors.USER_ERRORS as error:
-        return _report_failure(error, show="--traceback" in argv)
     except Exception as error:
-        if not errors.is_settings_error(error):
+        if not (isinstance(error, USER_ERRORS) or is_settings_error(error)):
             raise
-        return _report_failure(error, show="--traceback" in argv)
+        return _report_failure(unwrap_cause(error), show=any(_TRACEBACK_OPTION.fullmatch(a) for a in argv))
     except KeyboardInterrupt as stop:  # a sub-command may add how to continue
         print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -165,7 +168,8 @@ def _run_guarded(argv: list[str]) -> int:
 def _dispatch(argv: list[str]) -> int:
     if argv == ["--version"]:
         warnings.simplefilter("ignore", ImportWarning)  # of operators that are not compiled: the line has it
-        print(_format_version())
+        operators = importlib.import_module("dhtorch.ops.loader").describe_operators(advice=True)
+        print(f"dhtorch {dhtorch.__version__}, operators: {operators}")
         return EXIT_DONE
     if argv[:1] == ["help"]:
         argv = ["--help", *argv[1:]]
@@ -175,7 +179,13 @@ def _dispatch(argv: list[str]) -> int:
         print(commands.format_overview(EXIT_CODES))
         return EXIT_DONE
     named = argv[0] in commands.COMMANDS
-    name = argv[0] if named else "recover" if _is_capture(argv) else "run"
+    name = (
+        argv[0]
+        if named
+        else "recover"
+        if (bool(argv) and not _is_flag_or_deletion(argv[0]) and Path(argv[0]).expanduser().exists())
+        else "run"
+    )
     if not named and name == "run":
         _reject_missing_path(argv[0])
         words.validate_words(argv[:1], ["PATH", *commands.COMMANDS])
@@ -189,24 +199,22 @@ def _dispatch(argv: list[str]) -> int:
     if named:
         _reject_missing_input(name, argv)
     if name in _PARSED_COMMANDS:
-        return _run_parsed(name, argv, known)
+        # Run a command with its own argument parser
+        _check_flags(argv, _HELP_FLAGS)
+        unknown = [a for a in argv if not _is_positional(a) and a.partition("=")[0] not in known]
+        if unknown:
+            readers = [f"data.{option}" for option in _reader_options(config_dir())]
+            plain = [full.rpartition(".")[2] for full in known]
+            words.validate_option_names(unknown, {}, (), [*known, *readers], plain)
+        _set_threads(1)
+        parsed = commands.to_parser_arguments(argv, known)
+        return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
     if name == "run":
         argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
         argv = [_NO_HOLDOUT if a.partition("=")[0] == "~holdout" else a for a in argv]
         words.validate_words(argv, ())
         return _run_hydra(argv)
     return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
-
-
-def _format_version() -> str:
-    """Version, and what computes the operators."""
-    operators = importlib.import_module("dhtorch.ops.loader").describe_operators(advice=True)
-    return f"dhtorch {dhtorch.__version__}, operators: {operators}"
-
-
-def _is_capture(argv: Sequence[str]) -> bool:
-    """Whether the first argument is an existing path and no sub-command."""
-    return bool(argv) and not _is_flag_or_deletion(argv[0]) and Path(argv[0]).expanduser().exists()
 
 
 def _reject_missing_path(word: str) -> None:
@@ -242,19 +250,6 @@ def _reject_missing_input(name: str, argv: Sequence[str]) -> None:
             raise ValueError(f"{word}: no such file or folder{console.suggest_path(path)}, expected {expected}")
 
 
-def _run_parsed(name: str, argv: list[str], known: Mapping[str, commands.OptionNote]) -> int:
-    """Run a command with its own argument parser."""
-    _check_flags(argv, _HELP_FLAGS)
-    unknown = [a for a in argv if not _is_positional(a) and a.partition("=")[0] not in known]
-    if unknown:
-        readers = [f"data.{option}" for option in _reader_options(config_dir())]
-        plain = [full.rpartition(".")[2] for full in known]
-        words.validate_option_names(unknown, {}, (), [*known, *readers], plain)
-    _set_threads(1)
-    parsed = commands.to_parser_arguments(argv, known)
-    return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
-
-
 def _show_help(name: str, argv: list[str], *, everything: bool) -> int:
     """Print the help of a command; ``everything`` also lists the groups and the composed settings."""
     print(commands.format_command_help(name, config_dir()))
@@ -277,14 +272,44 @@ def _run_demo(argv: list[str]) -> int:
         raise ValueError(f"browser: found {options['browser']!r}, expected true or false")
     rest = [a for a in argv if a.partition("=")[0] not in ("out", "browser")]
     words.validate_words(rest, ())
-    from dhtorch.cli import demo  # noqa: PLC0415
+    import webbrowser  # noqa: PLC0415
+
+    from dhtorch.cli.view import has_screen  # noqa: PLC0415
 
     _set_threads(1)
-    capture, out = demo.write_demo_capture(Path(options["out"]))
-    code = _run_configured("recover", [str(capture), f"out={quote_value(str(out))}", *rest])
+    folder = Path(options["out"]).expanduser()
+    _write_demo_capture(folder)
+    out = folder / "result"
+    code = _run_configured("recover", [str(folder / "room"), f"out={quote_value(str(out))}", *rest])
     if code == EXIT_DONE:
-        demo.open_page(out / "view.html", in_browser=options["browser"] == "true")
+        address = (out / "view.html").absolute().as_uri()
+        print(f"Open {address}")
+        if options["browser"] == "true" and sys.stdout.isatty() and has_screen():
+            webbrowser.open(address)
     return code
+
+
+def _write_demo_capture(folder: Path) -> None:
+    """Write the room as a Stray Scanner capture ``room`` below ``folder``, unless it is there.
+
+    Six frames take half a minute on a quiet machine. The room is 6 m deep, so that much lies beyond the range of the
+    simulated LiDAR; the camera moves as in a slow walk.
+
+    Raises:
+        FileExistsError: ``folder`` has other content.
+    """
+    from dhtorch.export.stray import write_stray  # noqa: PLC0415
+    from dhtorch.synthetic.recording import SyntheticRoom  # noqa: PLC0415
+
+    unfinished = folder / "room.unfinished"
+    if (folder / "room" / "odometry.csv").is_file():
+        return
+    if folder.exists() and (not folder.is_dir() or any(each != unfinished for each in folder.iterdir())):
+        raise FileExistsError(f"out: {folder} has other content, expected a new or empty folder")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    room = SyntheticRoom(n_frames=6, hw=(240, 320), range_limit=2.5, step_m=0.05)
+    write_stray(unfinished, [room[k] for k in range(len(room))])
+    unfinished.rename(folder / "room")
 
 
 def _add_implied_choice(argv: list[str]) -> list[str]:
@@ -319,32 +344,34 @@ def job_name(overrides: str) -> str:
 
 def _run_configured(word: str, argv: list[str]) -> int:
     """Run a sub-command with Hydra overrides as one job in this process."""
-    from hydra.errors import HydraException  # noqa: PLC0415
-    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
-
     typed = sorted(argv, key=lambda each: not _is_positional(each))
     argv = _name_positionals(word, argv)
     if _HYDRA_INFO_FLAGS & {a.split("=")[0] for a in argv}:
         return _show_hydra_info(word, argv)
     _check_flags(argv, _HYDRA_INFO_FLAGS)
     words.validate_words(argv, ())
-    argv = words.quote_words(argv)
-    try:
-        settings, parts, groups = compose_settings(word, argv)
-    except (HydraException, OmegaConfBaseException) as error:
-        return _report_failure(errors.unwrap_cause(error), show="traceback=true" in argv)
+    settings, parts, groups = compose_settings(word, words.quote_words(argv))
     module = importlib.import_module(_CONFIGURED_COMMANDS[word])
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     disable_malloc_trim()
-    try:
-        _set_threads(settings.get("threads"))
-        if "data" in parts:
-            parts["data"] = _prepare_data(word, settings, parts["data"])
-        settings |= {"choices": groups} | ({"typed": typed} if word == "recover" else {})
-        with console.mute_if_quiet():
-            return int(module.run(settings, parts, progress=console.progress) or EXIT_DONE)
-    except errors.USER_ERRORS as error:
-        return _report_failure(error, show=settings.get("traceback", False))
+    _set_threads(settings.get("threads"))
+    data = parts.get("data")
+    if data is not None:
+        from dhtorch.cli.capture_checks import check_data, require_depth  # noqa: PLC0415
+        from dhtorch.data.scene import scenes_of  # noqa: PLC0415
+        from dhtorch.extract.cut import subsample_scenes  # noqa: PLC0415
+
+        if word in _SUBSAMPLED_COMMANDS:
+            max_frames = settings["max_frames"] if _SUBSAMPLED_COMMANDS[word] else None
+            data = subsample_scenes(scenes_of(data), settings["every"], max_frames)
+        data = check_data(data)
+        if word in _DEPTH_COMMANDS and settings.get("pose", "near") == "near" and not settings.get("without_depth"):
+            remedy = "without_depth=true writes empty maps" if word == "enrich" else None
+            require_depth(scenes_of(data), remedy=remedy)
+        parts["data"] = data
+    settings |= {"choices": groups} | ({"typed": typed} if word == "recover" else {})
+    with console.mute_if_quiet():
+        return int(module.run(settings, parts, progress=console.progress) or EXIT_DONE)
 
 
 def compose_settings(word: str, argv: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
@@ -383,21 +410,6 @@ def _set_threads(threads: int | None) -> None:
     if threads is not None:
         torch.set_num_threads(threads)
         set_opencv_threads(threads)
-
-
-def _prepare_data(name: str, settings: Mapping[str, Any], data: Any) -> Any:
-    """The scenes of a sub-command, with the wanted frames, and checked."""
-    from dhtorch.cli.capture_checks import check_data, require_depth  # noqa: PLC0415
-    from dhtorch.data.scene import scenes_of  # noqa: PLC0415
-    from dhtorch.extract.cut import subsample_scenes  # noqa: PLC0415
-
-    if name in _SUBSAMPLED_COMMANDS:
-        max_frames = settings["max_frames"] if _SUBSAMPLED_COMMANDS[name] else None
-        data = subsample_scenes(scenes_of(data), settings["every"], max_frames)
-    data = check_data(data)
-    if name in _DEPTH_COMMANDS and settings.get("pose", "near") == "near" and not settings.get("without_depth"):
-        require_depth(scenes_of(data), remedy="without_depth=true writes empty maps" if name == "enrich" else None)
-    return data
 
 
 def _check_device(name: str, device: str) -> None:
@@ -474,11 +486,14 @@ def _name_positionals(name: str, argv: Sequence[str]) -> list[str]:
     """The arguments with the option names of the positional ones added, first; a path chooses ``data=auto``."""
     options = _POSITIONAL_OPTIONS.get(name, ())
     places = [k for k, word in enumerate(argv) if _is_positional(word)][: len(options)]
-    if name == "view" and places and _lacks_result(argv[places[0]]):
-        options = ("data.root",)
+    if name == "view" and places:
+        place = Path(argv[places[0]])
+        has_result = any(place.glob("result.json")) or any(place.glob("*/result.json"))
+        if place.exists() and place.suffix not in (".json", ".ply") and not has_result:
+            options = ("data.root",)
     named = [f"{option}={quote_value(argv[k])}" for k, option in zip(places, options, strict=False)]
     rest = [word for k, word in enumerate(argv) if k not in places]
-    if places and options[0] == "data.root" and not _is_chosen(argv, "data"):
+    if places and options[0] == "data.root" and not any(a.startswith("data=") for a in argv):
         named.insert(0, "data=auto")
     return [*named, *rest]
 
@@ -491,18 +506,6 @@ def _is_positional(word: str) -> bool:
 def _is_flag_or_deletion(word: str) -> bool:
     """Whether an argument is a flag, an addition or a deletion (``~group``; ``~/`` is a path)."""
     return word.startswith(("-", "+")) or (word.startswith("~") and not word.startswith("~/"))
-
-
-def _lacks_result(word: str) -> bool:
-    """Whether an argument is an existing path without a result."""
-    place = Path(word)
-    if not place.exists() or place.suffix in (".json", ".ply"):
-        return False
-    return not any(place.glob("result.json")) and not any(place.glob("*/result.json"))
-
-
-def _is_chosen(argv: Sequence[str], group: str) -> bool:
-    return any(a.startswith(f"{group}=") for a in argv)
 
 
 def _show_hydra_info(name: str, argv: list[str]) -> int:
@@ -531,10 +534,8 @@ def _check_flags(argv: Iterable[str], known: set[str]) -> None:
 def _run_hydra(argv: list[str]) -> int:
     import hydra  # noqa: PLC0415  (a sub-command must not pay for it)
     from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
-    from hydra.errors import HydraException  # noqa: PLC0415
     from hydra.types import RunMode  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
-    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
     OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
     if _HYDRA_INFO_FLAGS & {a.split("=")[0] for a in argv}:
@@ -544,61 +545,56 @@ def _run_hydra(argv: list[str]) -> int:
     overrides = words.quote_words([a for a in argv if a not in _SWEEP_FLAGS], sweep)
     if console.get_verbosity() == "quiet":
         overrides.append("hydra/hydra_logging=disabled")  # the launcher's messages
-    try:
-        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
-            engine: Any = GlobalHydra.instance().hydra
-            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
-            # Misspelt names and invalid values fail here, in one line, before anything runs.
-            defaults, overrides = _check_overrides("run", overrides)
-            cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
-            settings_cfg: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
-            plain: Any = OmegaConf.to_container(settings_cfg)
-            words.validate_values(plain, defaults)
-            folder = _resolve_output_folder(cfg, overrides, sweep)
-            overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote_value(str(folder))}"]
-            resume_command = _format_resume_command(argv, folder)
-            with open_output_folder(folder, "output") as output:
-                if sweep:
-                    _check_sweep_files(output)
-                    return _run_sweep(engine, overrides, folder, resume_command, show_traceback=cfg.traceback)
-                return _run_single(engine, overrides, resume_command)
-    except (HydraException, OmegaConfBaseException) as error:
-        return _report_failure(error)
-
-
-def _check_sweep_files(output: OutputFolder) -> None:
-    """Raise FileExistsError for a link or a foreign file where a sweep writes beside its jobs."""
-    table, picture, settings = (output.path / name for name in ("sweep.csv", "sweep.png", "multirun.yaml"))
-    if output.is_unlisted and any(output.path.glob("*/result.json")):  # of an older version, without a manifest
-        output.adopt([table, settings])
-    output.check([table, picture])
-    output.claim(settings)  # written by Hydra
-
-
-def _run_single(engine: Any, overrides: Sequence[str], resume_command: str) -> int:
-    try:
-        status = engine.run("run", _run_hydra_job, list(overrides)).return_value
-    except KeyboardInterrupt:
-        go_on = "Finished scenes are kept. To run the rest:"
-        print(f"dhtorch: interrupted, no result written. {go_on}\n  {resume_command}", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    return EXIT_FAILED if status.state == "failed" else EXIT_DONE
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        engine: Any = GlobalHydra.instance().hydra
+        mode = RunMode.MULTIRUN if sweep else RunMode.RUN
+        # Misspelt names and invalid values fail here, in one line, before anything runs.
+        defaults, overrides = _check_overrides("run", overrides)
+        cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
+        settings_cfg: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
+        plain: Any = OmegaConf.to_container(settings_cfg)
+        words.validate_values(plain, defaults)
+        # Absolute folder of the job or the sweep (workers may have another working directory)
+        folder = Path(str(cfg.output)).absolute()
+        if cfg.resume and not any(o.startswith("output=") for o in overrides):
+            own = "" if sweep else job_name(cfg.hydra.job.override_dirname)
+            folder = (_RESUMED_FOLDER / own).absolute()
+        overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote_value(str(folder))}"]
+        resume_command = _format_resume_command(argv, folder)
+        with open_output_folder(folder, "output") as output:
+            if sweep:
+                table, picture, launched = (folder / name for name in ("sweep.csv", "sweep.png", "multirun.yaml"))
+                if output.is_unlisted and any(folder.glob("*/result.json")):
+                    output.adopt([table, launched])  # of an older version, without a manifest
+                output.check([table, picture, launched])
+                output.record(launched, None)  # written by Hydra
+                return _run_sweep(engine, overrides, folder, resume_command, show_traceback=cfg.traceback)
+            try:
+                status = engine.run("run", _run_hydra_job, overrides).return_value
+            except KeyboardInterrupt:
+                go_on = "Finished scenes are kept. To run the rest:"
+                print(f"dhtorch: interrupted, no result written. {go_on}\n  {resume_command}", file=sys.stderr)
+                return EXIT_INTERRUPTED
+            return EXIT_FAILED if status.state == "failed" else EXIT_DONE
 
 
 def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_command: str, show_traceback: bool) -> int:
     """Run all jobs of a sweep, print their states, return the exit code."""
-    from hydra.errors import HydraException  # noqa: PLC0415
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
 
+    parser = OverridesParser.create(config_loader=engine.config_loader)
+    swept = [each for each in parser.parse_overrides(list(overrides)) if each.is_sweep_override()]
+    n_jobs = math.prod(len(list(each.sweep_string_iterator())) for each in swept)
     go_on = f"Finished jobs are kept. To run the rest:\n  {resume_command}"
     try:
-        with together.show_sweep_progress(folder, _count_jobs(overrides)):
+        with together.show_sweep_progress(folder, n_jobs):
             batches = engine.multirun("run", _run_hydra_job, list(overrides))
     except KeyboardInterrupt:
         print(f"\ndhtorch: interrupted. {go_on}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except HydraException:
-        raise
     except Exception as error:  # the launcher broke, as when a worker process is killed
+        if type(error).__module__.startswith("hydra."):
+            raise
         _report_failure(error, show_traceback)
         print(go_on, file=sys.stderr)
         return EXIT_SOME_FAILED
@@ -606,7 +602,12 @@ def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_comma
     counts = Counter(job.return_value.state for job in jobs)
     shares = ", ".join(f"{counts[state]} {words}" for state, words in _JOB_STATES.items())
     with console.mute_if_quiet():
-        _print_comparison([Path(j.return_value.folder) for j in jobs if j.return_value.state != "failed"], folder)
+        # Print and write the table that compares the jobs of a sweep
+        folders = [Path(j.return_value.folder) for j in jobs if j.return_value.state != "failed"]
+        from dhtorch.experiments import report  # noqa: PLC0415
+        from dhtorch.runtime import results as result_files  # noqa: PLC0415
+
+        report.print_sweep([result_files.read_result(each / "result.json") for each in folders], folder)
         print(f"{console.format_count(len(jobs), 'job')}: {shares}", flush=True)
     if not counts["failed"]:
         return EXIT_DONE
@@ -617,24 +618,6 @@ def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_comma
             print(f"failed: {name}: {job.return_value.error}", file=sys.stderr)
     print(go_on, file=sys.stderr)
     return EXIT_SOME_FAILED
-
-
-def _count_jobs(overrides: Sequence[str]) -> int:
-    """Number of jobs of a sweep: all combinations."""
-    from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
-    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
-
-    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-    parsed = parser.parse_overrides(list(overrides))
-    return math.prod(len(list(o.sweep_string_iterator())) for o in parsed if o.is_sweep_override())
-
-
-def _print_comparison(folders: Sequence[Path], sweep: Path) -> None:
-    """Print and write the table that compares the jobs of a sweep."""
-    from dhtorch.experiments import report  # noqa: PLC0415
-    from dhtorch.runtime import results as result_files  # noqa: PLC0415
-
-    report.print_sweep([result_files.read_result(each / "result.json") for each in folders], sweep)
 
 
 def _run_hydra_job(cfg: Any) -> Any:
@@ -648,9 +631,7 @@ def _run_hydra_job(cfg: Any) -> Any:
 
 def _run_job(cfg: Any) -> Any:
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
-    from hydra.errors import InstantiationException  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
-    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
     console.configure_logging()
     from dhtorch.cli import job  # noqa: PLC0415
@@ -680,12 +661,12 @@ def _run_job(cfg: Any) -> Any:
             print(Path(status.folder) / "result.json", flush=True)
         return status
     except Exception as error:
-        cause = errors.unwrap_cause(error)
-        expected = isinstance(cause, (*errors.USER_ERRORS, OmegaConfBaseException, InstantiationException))
+        cause = unwrap_cause(error)
+        expected = isinstance(cause, USER_ERRORS) or is_settings_error(cause)
         _report_failure(cause, show=cfg.traceback or not expected)
         with contextlib.suppress(OSError):
             Path(runtime.output_dir).rmdir()  # only if empty
-        return job.JobStatus(runtime.output_dir, "failed", errors.format_error(cause))
+        return job.JobStatus(runtime.output_dir, "failed", format_error(cause))
     finally:
         if swept:
             together.mark_finished(sweep, name)
@@ -709,7 +690,7 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     except TypeError as error:  # of a flag like _partial_; those of a constructor are an InstantiationException
         raise ValueError(" ".join(str(error).split())) from error
     except Exception as error:
-        cause = errors.unwrap_cause(error)
+        cause = unwrap_cause(error)
         root = cfg.data.get("root")
         _reject_stacks(cause, root)
         below = _find_capture_below(cause, root)
@@ -756,13 +737,6 @@ def _reject_stacks(error: BaseException, root: Any) -> None:
         raise ValueError(f"{actual}, expected {expected}") from error
 
 
-def _resolve_output_folder(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:
-    """Absolute folder of the job or the sweep (workers may have another working directory)."""
-    if not cfg.resume or any(o.startswith("output=") for o in overrides):
-        return Path(str(cfg.output)).absolute()
-    return (_RESUMED_FOLDER if sweep else _RESUMED_FOLDER / job_name(cfg.hydra.job.override_dirname)).absolute()
-
-
 def _format_resume_command(argv: Iterable[str], folder: Path) -> str:
     """The command line that resumes this run."""
     words = [a for a in argv if not a.startswith(("resume=", "output="))]
@@ -776,5 +750,79 @@ def _format_resume_command(argv: Iterable[str], folder: Path) -> str:
 def _report_failure(error: BaseException, show: bool = False) -> int:
     if show:
         traceback.print_exception(error)
-    print(f"dhtorch: {errors.format_error(error)}", file=sys.stderr)
+    print(f"dhtorch: {format_error(error)}", file=sys.stderr)
     return EXIT_FAILED
+
+
+# ------------------------------------------------------------------------------------------------- errors and signals
+
+
+#: Exceptions raised by bad input: reported in one line, without a traceback.
+USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
+
+
+def unwrap_cause(error: BaseException) -> BaseException:
+    """The exception inside Hydra's InstantiationException; other exceptions unchanged."""
+    is_wrapper = type(error).__name__ == "InstantiationException"
+    return error.__cause__ if is_wrapper and error.__cause__ else error
+
+
+def format_error(error: BaseException) -> str:
+    """Exception -> message in one line."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    # A data-loader worker's message contains its whole traceback
+    lines = lines[-1:] if any("Original Traceback" in line for line in lines) else lines
+    message = " ".join(" ".join(lines).split())
+    if type(error).__name__ == "MissingMandatoryValue":
+        return f"{getattr(error, 'full_key', '')}: found no value, expected {getattr(error, 'full_key', '')}=VALUE"
+    if "hydra/launcher/" in message:
+        message += " (launchers are optional extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, KeyError) and len(error.args) == 1:
+        return str(error.args[0])
+    return (
+        message if isinstance(error, USER_ERRORS) or is_settings_error(error) else f"{type(error).__name__}: {message}"
+    )
+
+
+def is_settings_error(error: BaseException) -> bool:
+    """Whether the error is Hydra's, OmegaConf's or YAML's, whose messages name the option or the file."""
+    return type(error).__module__.startswith(("hydra.", "omegaconf.", "yaml."))
+
+
+#: Signals that end the command with clean-up.
+_TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+@contextlib.contextmanager
+def catch_termination() -> Iterator[list[int]]:
+    """Context in which the first SIGTERM or SIGHUP raises KeyboardInterrupt -> numbers of the received signals.
+
+    Later ones do not interrupt the clean-up. A killed process cannot end its workers: a worker watches its parent, see
+    :mod:`dhtorch.runtime.parent_watch`.
+    Signals that are ignored stay ignored (``nohup``); outside the main thread no handler is installed.
+    """
+    received: list[int] = []
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) == 1:
+            raise KeyboardInterrupt
+
+    old_handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        old_handlers = {
+            n: signal.signal(n, handle) for n in _TERMINATION_SIGNALS if signal.getsignal(n) is not signal.SIG_IGN
+        }
+    try:
+        yield received
+    finally:
+        if received:
+            # End the worker processes of joblib's launcher, if any: they outlive a call
+            pool = sys.modules.get("joblib.externals.loky.reusable_executor")
+            executor = getattr(pool, "_executor", None)
+            if executor is not None:
+                executor.shutdown(wait=True, kill_workers=True)
+        for number, handler in old_handlers.items():
+            signal.signal(number, handler)

@@ -39,7 +39,16 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
     Raises:
         ValueError, OSError: bad options or data, or views that match no frame.
     """
-    _check_options(settings)
+    if settings["sensor"] is not None:
+        get_sensor_noise(settings["sensor"])  # refuses an unknown class
+    if settings["device"] != "cpu":
+        raise ValueError(f"device: found {settings['device']!r}, expected cpu: the measurement is small")
+    if settings["frame"] not in ("model", "capture"):
+        raise ValueError(f"frame: found {settings['frame']!r}, expected model or capture")
+    if settings["max_frames"] is None:
+        raise ValueError("max_frames: found None, expected a whole number of at least 1")
+    if not settings["tolerance"] > 0:
+        raise ValueError(f"tolerance: found {settings['tolerance']!r}, expected a positive number")
     scenes = scenes_of(parts["data"])
     if len(scenes) > 1:
         raise ValueError(f"data: found {len(scenes)} recordings for one model, expected one (data.root=…)")
@@ -66,20 +75,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
         print(line)
     print(f"wrote {out}: {'the model in metres, ' if result.ok else ''}scale.json, scale.html")
     return 0 if result.ok else 1
-
-
-def _check_options(settings: Mapping[str, Any]) -> None:
-    if settings["sensor"] is not None:
-        get_sensor_noise(settings["sensor"])
-    if settings["device"] != "cpu":
-        raise ValueError(f"device: found {settings['device']!r}, expected cpu: the measurement is small")
-    if settings["frame"] not in ("model", "capture"):
-        raise ValueError(f"frame: found {settings['frame']!r}, expected model or capture")
-    if not (isinstance(settings["max_frames"], int) and settings["max_frames"] >= 1):
-        raise ValueError(f"max_frames: found {settings['max_frames']!r}, expected a whole number of at least 1")
-    for name in ("tolerance", "cutoff"):
-        if settings[name] is not None and not settings[name] > 0:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected a positive number")
 
 
 def describe_scale(result: ScaleResult) -> dict[str, Any]:

@@ -29,8 +29,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     Raises:
         ValueError, OSError: bad options or data.
     """
-    if settings["dtype"] not in ("float32", "float64"):
-        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     path = Path(settings["output"]) / "stream.json"
     with open_output_folder(path.parent, "output") as folder:
         folder.check([path])

@@ -74,17 +74,6 @@ def show_sweep_progress(folder: Path, n_jobs: int) -> Iterator[None]:
         shutil.rmtree(notes, ignore_errors=True)
 
 
-def _read_progress(notes: Path) -> tuple[float, int, list[str]]:
-    """Sum of the jobs' finished fractions, number of finished jobs, texts of the running ones."""
-    shares, texts = [], []
-    for path in sorted(p for p in notes.glob("*") if not p.name.endswith("~")):
-        with contextlib.suppress(OSError, ValueError):
-            share, _, text = path.read_text(encoding="utf-8").partition(" ")
-            shares.append(float(share))
-            texts += [text] if text and float(share) < 1 else []
-    return sum(shares), sum(s >= 1 for s in shares), texts
-
-
 def _draw_bar(notes: Path, n_jobs: int, stop: threading.Event) -> None:
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
@@ -93,11 +82,18 @@ def _draw_bar(notes: Path, n_jobs: int, stop: threading.Event) -> None:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(f"0 of {format_count(n_jobs, 'job')}", total=n_jobs)
         while not stop.wait(_PAUSE_S):
-            done, n_finished, texts = _read_progress(notes)
+            # Sum of the jobs' finished fractions, number of finished jobs, texts of the running ones
+            shares, texts = [], []
+            for path in sorted(p for p in notes.glob("*") if not p.name.endswith("~")):
+                with contextlib.suppress(OSError, ValueError):
+                    fraction, _, text = path.read_text(encoding="utf-8").partition(" ")
+                    shares.append(float(fraction))
+                    texts += [text] if text and float(fraction) < 1 else []
+            n_finished = sum(share >= 1 for share in shares)
             description = f"{n_finished} of {format_count(n_jobs, 'job')}" + (
                 f", {', '.join(texts[:2])}" if texts else ""
             )
-            bar.update(task, completed=done, description=description)
+            bar.update(task, completed=sum(shares), description=description)
 
 
 def _write_note(note: Path, share: float, text: str) -> None:

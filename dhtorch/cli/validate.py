@@ -18,16 +18,16 @@ from typing import Any
 
 import torch
 
+from dhtorch.cli.completed_folder import load_frame
 from dhtorch.codes import State, WrongCause, names, words
 from dhtorch.data import depth_maps
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.method import Method
 from dhtorch.pytree import stack
-from dhtorch.records import DepthValidation, Frame
+from dhtorch.records import DepthValidation
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
@@ -86,15 +86,6 @@ class RecordingValidation:
         """Doubts about the maps, and notes on their unit and on the matching of files to frames."""
         return [] if self.maps is None else [*self.maps.doubts, *self.maps.notes]
 
-    def frame_positions(self, every: int) -> list[int]:
-        """Every ``every``-th position of the frames that have a map."""
-        return list(range(len(self.scene.recording)) if self.maps is None else self.maps.frames)[::every]
-
-    @property
-    def by_number(self) -> dict[int, Row]:
-        """Rows of the validated frames by frame number."""
-        return {row["frame"]: row for row in self.rows}
-
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
     """Validate every scene of the settings; returns the exit code, 1 where a limit is exceeded.
@@ -102,7 +93,11 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     Raises:
         ValueError, OSError: bad options or data.
     """
-    limits = _check_options(settings)
+    if settings["size"] < 16:
+        raise ValueError(f"size: found {settings['size']!r}, expected a whole number of at least 16")
+    if settings["window"] == 1:
+        raise ValueError("window: found 1, expected 0 or at least 2 frames")
+    limits = parse_limits(settings["fail_on"])
     scenes = scenes_of(parts["data"])
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
@@ -110,42 +105,42 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     folders = [folder if len(scenes) == 1 else folder / scene.name for scene in scenes]
     with open_output_folder(folder, "output") as output:
         output.check(place / name for place in folders for name in ("validate.json", "validate.html"))
-        return _validate_scenes(scenes, folders, parts["method"], settings, limits, progress)
-
-
-def _validate_scenes(
-    scenes: Sequence[Scene],
-    folders: Sequence[Path],
-    method: Method,
-    settings: Mapping[str, Any],
-    limits: Mapping[str, float],
-    progress: Progress,
-) -> int:
-    """Validate the scenes, write the files of each into its folder and print the summary; returns the exit code."""
-    written, all_exceeded, lines = [], [], []
-    for scene, scene_folder in zip(scenes, folders, strict=True):
-        maps = None
-        if settings["depth"] is not None:
-            maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
-        validation = _validate_recording(RecordingValidation(scene, maps), method, settings, progress)
-        summary = _summarise_recording(validation)
-        exceeded = list_exceeded_limits(summary, limits)
-        content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
-        content |= {} if maps is None else {"maps": maps.report}
-        content |= {"notes": list(scene.recording.report)}
-        content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
-        content |= {"exceeded": exceeded, "whole": summary, "windows": validation.windows, "frames": validation.rows}
-        written += [
-            storage.write_json(scene_folder / "validate.json", storage.to_strict_json(content)),
-            _write_page(scene_folder, validation, summary, exceeded),
-        ]
-        lines += [
-            *_format_summary(validation.scene.name, summary, validation.notes),
-            *(f"  exceeded: {limit_line}" for limit_line in exceeded),
-        ]
-        all_exceeded += exceeded
-    print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
-    return int(bool(all_exceeded))
+        # Validate the scenes, write the files of each into its folder and print the summary; returns the
+        # exit code
+        method = parts["method"]
+        written, all_exceeded, lines = [], [], []
+        for scene, scene_folder in zip(scenes, folders, strict=True):
+            maps = None
+            if settings["depth"] is not None:
+                maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
+            validation = _validate_recording(RecordingValidation(scene, maps), method, settings, progress)
+            summary = _summarise_recording(validation)
+            exceeded = list_exceeded_limits(summary, limits)
+            content = {
+                "scene": scene.name,
+                "source": "sensor" if maps is None else "maps",
+                "fail_on": settings["fail_on"],
+            }
+            content |= {} if maps is None else {"maps": maps.report}
+            content |= {"notes": list(scene.recording.report)}
+            content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
+            content |= {
+                "exceeded": exceeded,
+                "whole": summary,
+                "windows": validation.windows,
+                "frames": validation.rows,
+            }
+            written += [
+                storage.write_json(scene_folder / "validate.json", storage.to_strict_json(content)),
+                _write_page(scene_folder, validation, summary, exceeded),
+            ]
+            lines += [
+                *_format_summary(validation.scene.name, summary, validation.notes),
+                *(f"  exceeded: {limit_line}" for limit_line in exceeded),
+            ]
+            all_exceeded += exceeded
+        print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
+        return int(bool(all_exceeded))
 
 
 def list_exceeded_limits(
@@ -187,48 +182,44 @@ def _validate_recording(
 ) -> RecordingValidation:
     """Validate the frames one by one, then diagnose windows of frames."""
     n = len(validated.scene.recording)
-    frames = validated.frame_positions(settings["every"])[: settings["max_frames"]]
+    with_map = list(range(n)) if validated.maps is None else validated.maps.frames
+    frames = with_map[:: settings["every"]][: settings["max_frames"]]
     for i in progress(frames, f"{validated.scene.name}: frames", len(frames)):
-        frame = _load_frame(validated.scene, settings, i)
-        frame_validation = _validate_frame(validated, frame, i, method, settings)
+        frame = load_frame(validated.scene, settings, i)
+        recording = validated.scene.recording
+        depth, source_views, source_maps = None, None, None
+        if validated.maps is not None:
+            depth_map = validated.maps[i]
+            depth = torch.zeros(1, *frame.hw) if depth_map is None else depth_map
+            depth = depth.to(frame.camera.f)
+        if len(recording) > 1:
+            offered = candidate_frames(recording, i, settings["steps"])
+            source_views = stack([load_frame(validated.scene, settings, k) for k in offered])
+            maps = [] if validated.maps is None else [validated.maps[k] for k in offered]
+            available = [m for m in maps if m is not None]
+            if available and len({m.shape for m in available}) == 1:
+                source_maps = torch.stack([torch.zeros_like(available[0]) if m is None else m for m in maps])
+        options = {k: settings[k] for k in ("views", "source_views", "size", "tolerance", "seed")}
+        frame_validation = validate_depth(
+            depth, frame, source_views, other_maps=source_maps, method=method, hint=validated.scene.hint, **options
+        )
         row = _summarise_frame(int(validated.scene.recording.number[i]), frame_validation)
         validated.rows.append(row)
-        _keep_worst(validated, frame, frame_validation, settings)
+        # Figures of the worst frames so far are kept
+        worst = sorted(validated.rows, key=_severity, reverse=True)[: settings["pictures"]]
+        kept = {each["frame"] for each in worst}
+        if row["frame"] in kept:
+            out, single = io.BytesIO(), frame_validation[0]
+            title = append_cutoff(format_frame(validated.scene.name, row["frame"]), settings["cutoff"])
+            draw_validation(out, frame.image[0].cpu(), single.depth, single.state, single.evidence, title=title)
+            validated.pictures[row["frame"]] = out.getvalue()
+            validated.pictures = {k: v for k, v in validated.pictures.items() if k in kept}
     if settings["window"]:
         size = min(settings["window"], n)
         firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
         for first in progress(firsts, f"{validated.scene.name}: windows", len(firsts)):
             validated.windows.append(_diagnose_window(validated, first, size, settings))
     return validated
-
-
-def _load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
-    frame = scene.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
-    if 0 in frame.hw:
-        raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
-    return range_split(frame, settings["cutoff"])
-
-
-def _validate_frame(
-    validated: RecordingValidation, frame: Frame, i: int, method: Method, settings: Mapping[str, Any]
-) -> DepthValidation:
-    recording = validated.scene.recording
-    depth, source_views, source_maps = None, None, None
-    if validated.maps is not None:
-        depth_map = validated.maps[i]
-        depth = torch.zeros(1, *frame.hw) if depth_map is None else depth_map
-        depth = depth.to(frame.camera.f)
-    if len(recording) > 1:
-        offered = candidate_frames(recording, i, settings["steps"])
-        source_views = stack([_load_frame(validated.scene, settings, k) for k in offered])
-        maps = [] if validated.maps is None else [validated.maps[k] for k in offered]
-        available = [m for m in maps if m is not None]
-        if available and len({m.shape for m in available}) == 1:
-            source_maps = torch.stack([torch.zeros_like(available[0]) if m is None else m for m in maps])
-    options = {k: settings[k] for k in ("views", "source_views", "size", "tolerance", "seed")}
-    return validate_depth(
-        depth, frame, source_views, other_maps=source_maps, method=method, hint=validated.scene.hint, **options
-    )
 
 
 def _summarise_frame(number: int, validation: DepthValidation) -> Row:
@@ -257,24 +248,6 @@ def _summarise_frame(number: int, validation: DepthValidation) -> Row:
     return row | {"clip_depth": None if math.isnan(clip_depth) else clip_depth}
 
 
-def _keep_worst(
-    validated: RecordingValidation, frame: Frame, validation: DepthValidation, settings: Mapping[str, Any]
-) -> None:
-    """Keep the figures of the worst frames so far."""
-    order = sorted(range(len(validated.rows)), key=lambda k: -_severity(validated.rows[k]))[: settings["pictures"]]
-    latest = len(validated.rows) - 1
-    if latest not in order:
-        return
-    out = io.BytesIO()
-    single = validation[0]
-    number = validated.rows[latest]["frame"]
-    title = append_cutoff(format_frame(validated.scene.name, number), settings["cutoff"])
-    draw_validation(out, frame.image[0].cpu(), single.depth, single.state, single.evidence, title=title)
-    validated.pictures[number] = out.getvalue()
-    kept = {validated.rows[k]["frame"] for k in order}
-    validated.pictures = {k: v for k, v in validated.pictures.items() if k in kept}
-
-
 def _severity(row: Row) -> float:
     """Sort key of the frames: fraction of wrong pixels among all."""
     wrong = row["share_wrong"]
@@ -283,7 +256,7 @@ def _severity(row: Row) -> float:
 
 def _diagnose_window(validated: RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
     """Diagnose ``size`` consecutive frames -> row with the likely cause."""
-    frames = [_load_frame(validated.scene, settings, k) for k in range(first, first + size)]
+    frames = [load_frame(validated.scene, settings, k) for k in range(first, first + size)]
     diagnosis = faults.Diagnosis(None, None, {}, 0)
     if validated.maps is None:
         diagnosis = faults.diagnose(frames, seed=settings["seed"])
@@ -301,12 +274,12 @@ def _diagnose_window(validated: RecordingValidation, first: int, size: int, sett
         "pairs": diagnosis.n_pairs,
         "by": diagnosis.by,
     }
-    clip_depth = _find_shared_clip_depth(
-        [validated.by_number[k] for k in number[first : first + size].tolist() if k in validated.by_number]
-    )
-    if diagnosis.cause is None and clip_depth is not None:
-        return row | {"cause": f"cut at {clip_depth:.3g} m", "kind": "cut", "loss": dict(diagnosis.loss)}
-    return row | {"cause": diagnosis.cause, "kind": diagnosis.kind, "loss": dict(diagnosis.loss)}
+    numbers = set(number[first : first + size].tolist())
+    clip_depth = _find_shared_clip_depth([each for each in validated.rows if each["frame"] in numbers])
+    cause, kind = diagnosis.cause, diagnosis.kind
+    if cause is None and clip_depth is not None:
+        cause, kind = f"cut at {clip_depth:.3g} m", "cut"
+    return row | {"cause": cause, "kind": kind, "loss": dict(diagnosis.loss)}
 
 
 def _find_shared_clip_depth(rows: Sequence[Row]) -> float | None:
@@ -335,13 +308,24 @@ def _summarise_recording(validated: RecordingValidation) -> Row:
     least = DEFAULT_VALIDATION_OPTIONS.min_window_pairs
     diagnosable = [row for row in validated.windows if row["pairs"] >= least or row["cause"] is not None]
     causes = Counter(row["cause"] for row in diagnosable if row["cause"] is not None)
+    known = [(row["wrong"]["low"], row["pixels"] * (1 - row["share_cannot_know"])) for row in rows if row["wrong"]]
+    weight = sum(n for _, n in known)
+    # Lower bound of the two-sided 95 % interval of a fraction
+    n_caused, n_windows = (torch.tensor([float(n)]) for n in (sum(causes.values()), len(diagnosable)))
+    of_windows = float(share_interval(n_caused, n_windows)[0, 1])
+    # Difference of scale between frames: largest lower minus smallest upper bound, a tenth of the frames left out at
+    # either end; 0 where one scale is in all intervals
+    scales = [row["scale"] for row in rows if row["scale"] is not None]
+    low, high = (sorted(x[bound] for x in scales) for bound in ("low", "high"))
+    rest = len(scales) // 10
+    drift = max(low[-1 - rest] - high[rest], 0.0) if len(scales) > 1 else None
     limited = {
-        "wrong": _wrong_lower_bound(rows),
+        "wrong": (sum(low * n for low, n in known) / weight if weight else None),
         "scale": _deviation_lower_bound(rows, "scale", 1.0),
         "shift": _deviation_lower_bound(rows, "shift", 0.0),
         "tilt": _deviation_lower_bound(rows, "tilt", 0.0),
-        "drift": _drift_lower_bound(rows),
-        "causes": _share_lower_bound(sum(causes.values()), len(diagnosable)),
+        "drift": drift,
+        "causes": None if math.isnan(of_windows) else of_windows,
         "unknown": count["cannot_know"] / pixels if pixels else None,
     }
     return {
@@ -350,16 +334,15 @@ def _summarise_recording(validated: RecordingValidation) -> Row:
         "pixels": pixels,
         "median": medians,
         "wrong": count["wrong"] / checked if checked else None,
-        "wrong_causes": {name: _sum_cause(rows, name) / checked if checked else None for name in _NAMED_CAUSES},
+        "wrong_causes": {
+            name: sum(row["wrong_causes"][name] for row in rows) / checked if checked else None
+            for name in _NAMED_CAUSES
+        },
         "causes": dict(causes),
         "windows": len(diagnosable),
         "clip_depth": _find_shared_clip_depth(rows),
         "limited": limited,
     }
-
-
-def _sum_cause(rows: Sequence[Row], name: str) -> int:
-    return sum(row["wrong_causes"][name] for row in rows)
 
 
 def _deviation_lower_bound(rows: Sequence[Row], name: str, sound: float) -> float | None:
@@ -374,38 +357,14 @@ def _deviation_lower_bound(rows: Sequence[Row], name: str, sound: float) -> floa
     return max(low - sound, sound - high, 0.0)
 
 
-def _drift_lower_bound(rows: Sequence[Row]) -> float | None:
-    """Lower bound of the difference of scale between frames: largest lower minus smallest upper bound, a tenth of the
-    frames left out at either end; 0 where one scale is in all intervals."""
-    known = [row["scale"] for row in rows if row["scale"] is not None]
-    if len(known) < 2:
-        return None
-    low, high = (sorted(x[bound] for x in known) for bound in ("low", "high"))
-    rest = len(known) // 10
-    return max(low[-1 - rest] - high[rest], 0.0)
-
-
-def _wrong_lower_bound(rows: Sequence[Row]) -> float | None:
-    """Lower bounds of the frames' wrong fractions, averaged with the number of checked pixels as weight."""
-    known = [(row["wrong"]["low"], row["pixels"] * (1 - row["share_cannot_know"])) for row in rows if row["wrong"]]
-    weight = sum(n for _, n in known)
-    return sum(low * n for low, n in known) / weight if weight else None
-
-
-def _share_lower_bound(part: int, whole: int) -> float | None:
-    """Lower bound of the two-sided 95 % interval of a fraction."""
-    low = float(share_interval(torch.tensor([float(part)]), torch.tensor([float(whole)]))[0, 1])
-    return None if math.isnan(low) else low
-
-
 def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[str]:
     """Printed summary of a recording."""
     limited, medians = summary["limited"], summary["median"]
-    wrong = (
-        "no pixel can be checked"
-        if summary["wrong"] is None
-        else f"{summary['wrong']:.1%} of the checked pixels are wrong{_format_wrong_causes(summary['wrong_causes'])}"
-    )
+    wrong = "no pixel can be checked"
+    if summary["wrong"] is not None:
+        named = [(x, cause) for cause, x in summary["wrong_causes"].items() if x and x >= _MIN_NAMED_SHARE]
+        shown = ", ".join(f"{x:.1%} {words(cause)}" for x, cause in sorted(named, reverse=True))
+        wrong = f"{summary['wrong']:.1%} of the checked pixels are wrong{f' ({shown})' if shown else ''}"
     unknown = "no depth" if limited["unknown"] is None else f"{limited['unknown']:.1%} cannot be checked"
     scale = "scale unknown" if medians["scale"] is None else f"scale {_format_factor(medians['scale'])}"
     lines = [f"{name}: {format_count(summary['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
@@ -416,16 +375,8 @@ def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[
     if summary["clip_depth"] is not None and not any(cause.startswith("cut at") for cause in summary["causes"]):
         lines.append(f"  cut at {summary['clip_depth']:.3g} m: larger depths are set to this value")
     if summary["has_maps"]:
-        lines += [f"  {line}" for line in _name_wrong_scale(medians, limited["scale"])]
+        lines += _name_wrong_scale(medians, limited["scale"])
     return lines + [f"  {note}" for note in notes]
-
-
-def _format_wrong_causes(share: Mapping[str, float | None]) -> str:
-    """Fractions of the checked pixels by cause -> `` (1.2% flying pixel, 0.4% edge bleed)``; empty without any."""
-    named = sorted(
-        ((value, name) for name, value in share.items() if value and value >= _MIN_NAMED_SHARE), reverse=True
-    )
-    return f" ({', '.join(f'{value:.1%} {words(name)}' for value, name in named)})" if named else ""
 
 
 def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | None) -> list[str]:
@@ -439,7 +390,7 @@ def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | No
     scale, sensor = medians["scale"], medians["scale_vs_trajectory"]
     if scale is None or scale <= 0 or not deviation or abs(math.log(scale)) < _MIN_SCALE_DIFFERENCE:
         return []
-    start = f"maps are {_format_factor(scale)} times the sensor's depth"
+    start = f"  maps are {_format_factor(scale)} times the sensor's depth"
     if sensor is None or sensor <= 0:
         return [f"{start}; without usable poses which of the two is wrong cannot be determined"]
     off_maps = abs(math.log(scale * sensor))
@@ -476,24 +427,3 @@ def _write_page(place: Path, validated: RecordingValidation, whole: Row, exceede
         frames=frames,
         failed=failed,
     )
-
-
-def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
-    """Validate the options early; returns the limits of ``fail_on``."""
-    for name, low in (
-        ("every", 1),
-        ("max_frames", 1),
-        ("window", 0),
-        ("pictures", 0),
-        ("source_views", 1),
-        ("size", 16),
-    ):
-        value = settings[name]
-        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not is_whole and not (name == "max_frames" and value is None):
-            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
-    if settings["window"] == 1:
-        raise ValueError("window: found 1, expected 0 or at least 2 frames")
-    if settings["dtype"] not in ("float32", "float64"):
-        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    return parse_limits(settings["fail_on"])

@@ -53,7 +53,18 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             if name is not None:
                 stack.enter_context(open_output_file(name, option))
         scene = _make_scene(target, settings, parts, progress)
-        for line in [*notes, *_show_exhibit(scene, page, recording)]:
+        # Write the page or recording, or open the viewer -> printed lines
+        lines = []
+        if page is None and recording is None:
+            rrd.spawn_viewer(scene)
+            lines.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
+        if page is not None:
+            path = html.write_viewer_page(Path(page), scene)
+            lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
+        if recording is not None:
+            path = rrd.write_rrd(Path(recording), scene)
+            lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
+        for line in [*notes, *lines]:
             print(line)
     return 0
 
@@ -65,28 +76,26 @@ def _make_scene(
     if target is not None and target.suffix == ".ply":
         return points.read_ply_exhibit(target)
     if target is not None:
-        return _load_result_exhibit(target, settings, progress)
+        # The exhibit of a result: computed again, or only its points
+        result = result_files.read_result(target)
+        folder = target if target.is_dir() else target.parent
+        config, name = result["config"], settings["scene"]
+        result_settings = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
+        try:
+            parts = again.rebuild_parts(result, settings["root"] or _read_data_root(folder))
+            scene = _compute_exhibit(parts, result_settings, partial(again.read_cutoff, result), progress)
+        except (OSError, FormatError) as error:
+            scenes = result["data"]["scenes"]
+            ply = folder / str(_select_item(scenes, name, str)) / "points.ply"
+            if not ply.is_file():
+                raise ValueError(f"{error}; set root=PATH to the folder of the data") from error
+            print(
+                f"{error}; showing only the points of {ply} (set root=PATH to the folder of the data)", file=sys.stderr
+            )
+            return replace(points.read_ply_exhibit(ply), name=str(_select_item(scenes, name, str)))
+        facts = {"experiment": result["experiment"], "data": result["data"]["name"], "created": result["meta"]["utc"]}
+        return replace(scene, facts={**facts, **scene.facts})
     return _compute_exhibit(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
-
-
-def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
-    """The exhibit of a result: computed again, or only its points."""
-    result = result_files.read_result(target)
-    folder = target if target.is_dir() else target.parent
-    config, name = result["config"], settings["scene"]
-    result_settings = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
-    try:
-        parts = again.rebuild_parts(result, settings["root"] or _read_data_root(folder))
-        scene = _compute_exhibit(parts, result_settings, partial(again.read_cutoff, result), progress)
-    except (OSError, FormatError) as error:
-        scenes = result["data"]["scenes"]
-        ply = folder / str(_select_item(scenes, name, str)) / "points.ply"
-        if not ply.is_file():
-            raise ValueError(f"{error}; set root=PATH to the folder of the data") from error
-        print(f"{error}; showing only the points of {ply} (set root=PATH to the folder of the data)", file=sys.stderr)
-        return replace(points.read_ply_exhibit(ply), name=str(_select_item(scenes, name, str)))
-    facts = {"experiment": result["experiment"], "data": result["data"]["name"], "created": result["meta"]["utc"]}
-    return replace(scene, facts={**facts, **scene.facts})
 
 
 def _read_data_root(folder: Path) -> str | None:
@@ -101,11 +110,9 @@ def _compute_exhibit(
 ) -> Exhibit:
     """Compute the exhibit of the selected scene; ``cutoff``: scene name -> cutoff, m."""
     scene = _select_item(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
-    dtype = getattr(torch, str(settings["dtype"]), None)
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    if not isinstance(settings["max_frames"], int) or settings["max_frames"] < 1:
-        raise ValueError(f"max_frames: found {settings['max_frames']!r}, expected a whole number of at least 1")
+    if settings["max_frames"] is None:
+        raise ValueError("max_frames: found None, expected a whole number of at least 1")
+    dtype = getattr(torch, settings["dtype"])
     common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
         "most": settings["max_frames"],
@@ -138,21 +145,6 @@ def _choose_file(folder: Path) -> tuple[str | None, str | None, list[str]]:
         note = "Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead"
         return str(folder / "view.html"), None, [note]
     return None, None if has_screen() else str(folder / "view.rrd"), []
-
-
-def _show_exhibit(scene: Exhibit, page: str | None, save: str | None) -> list[str]:
-    """Write the page or recording, or open the viewer -> printed lines."""
-    lines = []
-    if page is None and save is None:
-        rrd.spawn_viewer(scene)
-        lines.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
-    if page is not None:
-        path = html.write_viewer_page(Path(page), scene)
-        lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
-    if save is not None:
-        path = rrd.write_rrd(Path(save), scene)
-        lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
-    return lines
 
 
 def has_screen() -> bool:

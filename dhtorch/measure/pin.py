@@ -220,7 +220,12 @@ class CameraPin:
             start = cam.project(camera, se3.apply(fit.T, seen.xyz.mT).to(picture))
             uv = self._leave_out(fit.inlier | ~self.known)
             hint = TrackHint(pyramid=self.pyramid, start=start, levels=PREDICTED_LEVELS)
-            seen = self._see(_select_tracks(_TRACKER(self.picture, picture, uv, hint=hint), tracks), camera)
+            # The valid tracks of the first, else those of the second
+            first = _TRACKER(self.picture, picture, uv, hint=hint)
+            k = first.valid[..., None]
+            cov = torch.where(k[..., None], first.cov, tracks.cov)
+            uv_1 = torch.where(k, first.uv_1, tracks.uv_1)
+            seen = self._see(tracks.replace(uv_1=uv_1, cov=cov, valid=first.valid | tracks.valid), camera)
             fit = self._fit(seen, fit.T)
         return self._conclude(fit, seen)
 
@@ -350,11 +355,3 @@ class CameraPin:
 
 #: The tracker: pyramids, then windows with affine motion, gain and bias.
 _TRACKER = partial(lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, track=partial(lucas_kanade, normalise="bias"))
-
-
-def _select_tracks(first: Tracks, second: Tracks) -> Tracks:
-    """The valid tracks of the first, else those of the second."""
-    k = first.valid[..., None]
-    cov = torch.where(k[..., None], first.cov, second.cov)
-    uv_1 = torch.where(k, first.uv_1, second.uv_1)
-    return second.replace(uv_1=uv_1, cov=cov, valid=first.valid | second.valid)

@@ -103,7 +103,17 @@ def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
     """Files of the module with ``name``, and of the packages loaded with it."""
     first, *rest = name.split(".")
     if first != _PACKAGE:
-        return _find_external_file(name)
+        # File of the third-party module with ``name``
+        parts = name.split(".")
+        for length in range(len(parts), 0, -1):
+            try:
+                spec = importlib.util.find_spec(".".join(parts[:length]))
+            except (ImportError, ValueError, AttributeError):
+                continue
+            if spec is not None:
+                is_python = spec.origin is not None and spec.origin.endswith(".py")
+                return {_EXTERNAL_PREFIX + spec.name: Path(str(spec.origin))} if is_python else {}
+        return {}
     for length in range(len(rest), -1, -1):
         base = folder.joinpath(*rest[:length])
         if length and (path := base.with_suffix(".py")).is_file():
@@ -114,17 +124,3 @@ def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
         return {}
     packages = [folder.joinpath(*rest[:above], "__init__.py") for above in range(length - 1, -1, -1)]
     return {p.relative_to(folder).as_posix(): p for p in (path, *packages) if p.is_file()}
-
-
-def _find_external_file(name: str) -> dict[str, Path]:
-    """File of the third-party module with ``name``."""
-    parts = name.split(".")
-    for length in range(len(parts), 0, -1):
-        try:
-            spec = importlib.util.find_spec(".".join(parts[:length]))
-        except (ImportError, ValueError, AttributeError):
-            continue
-        if spec is not None:
-            is_python = spec.origin is not None and spec.origin.endswith(".py")
-            return {_EXTERNAL_PREFIX + spec.name: Path(str(spec.origin))} if is_python else {}
-    return {}

@@ -72,13 +72,11 @@ def escape_control(text: str) -> str:
     if text.isascii() and text.isprintable():
         return text
     return "".join(
-        c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _escape_character(c)
+        c
+        if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
+        else (f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}" if ord(c) < 65536 else f"\\U{ord(c):08x}")
         for c in text
     )
-
-
-def _escape_character(c: str) -> str:
-    return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}" if ord(c) < 65536 else f"\\U{ord(c):08x}"
 
 
 def escape_markup(text: str) -> str:
@@ -147,20 +145,17 @@ def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            rate = _format_rate(done, total, now - start)
+            # Rate and time left: ``1.4/s, 0:35 left``, ``5.2 s each, 2:40 left``
+            seconds = now - start
+            each = max(seconds, 1e-6) / done
+            left = round(each * max(0, total - done))
+            rate = f"{1 / each:.1f}/s" if each < 1 else f"{each:.1f} s each"
+            hours, minutes = divmod(left // 60, 60)
+            rate = f"{rate}, {f'{hours}:{minutes:02d}' if hours else minutes}:{left % 60:02d} left"
             bar.update(task, advance=1, rate=rate)
             if not (is_quiet or is_terminal) and done < total and now - last_line >= _LINE_INTERVAL_S:
                 print(f"{text}: {done} of {total}, {rate}", file=sys.stderr, flush=True)
                 last_line = now
-
-
-def _format_rate(done: int, total: int, seconds: float) -> str:
-    """Rate and time left: ``1.4/s, 0:35 left``, ``5.2 s each, 2:40 left``."""
-    each = max(seconds, 1e-6) / done
-    left = round(each * max(0, total - done))
-    rate = f"{1 / each:.1f}/s" if each < 1 else f"{each:.1f} s each"
-    hours, minutes = divmod(left // 60, 60)
-    return f"{rate}, {f'{hours}:{minutes:02d}' if hours else minutes}:{left % 60:02d} left"
 
 
 def get_verbosity() -> str:

@@ -15,16 +15,23 @@ import contextlib
 import errno
 import json
 import os
+import socket
 import stat
+import time
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
 
-from dhtorch.runtime.file_lock import acquire_file_lock
 from dhtorch.runtime.safe_open import MAX_TEXT_BYTES, describe_kind, read_bytes
+
+fcntl: ModuleType | None
+try:
+    import fcntl
+except ImportError:  # not on this system: no locking
+    fcntl = None
 
 #: Name of the private folder.
 PRIVATE_FOLDER = ".dhtorch"
@@ -32,48 +39,21 @@ PRIVATE_FOLDER = ".dhtorch"
 #: Names in the private folder: lock, manifest, folder of unfinished files.
 _LOCK, _MANIFEST, _UNFINISHED = "lock", "manifest", "unfinished"
 
+#: Content of a file in the manifest: size in bytes, CRC-32, and CRC-32 of the first ``_HEAD_BYTES``.
+_Identity = tuple[int, int, int]
+
 #: Bytes at the beginning of a file by which a shortened one (lost end after a crash of the system) is recognised.
 #: Source: derived, 64 = the PNG header and the first compressed bytes.
 _HEAD_BYTES = 64
 
-#: Bytes read at a time. Source: chosen on no data, any size reads equally fast.
-_BLOCK_BYTES = 1 << 20
-
-#: Size in the manifest of a file whose content another program writes: any content is dhtorch's own.
-_ANY_SIZE = -1
+#: Identity of a file whose content another program writes: any content is dhtorch's own.
+_ANY_CONTENT: _Identity = (-1, 0, 0)
 
 #: Longest name of a file or folder. Source: NAME_MAX of Linux's and macOS's file systems, and of Windows.
 _MAX_NAME_BYTES = 255
 
 #: Suffix of a file while it is written beside its place; its name begins with a dot.
 UNFINISHED_SUFFIX = ".tmp"
-
-
-class FileIdentity(NamedTuple):
-    """What identifies the content of a file: size, CRC-32, and CRC-32 of its first bytes."""
-
-    size: int  # bytes
-    crc: int
-    head_crc: int
-
-    @classmethod
-    def of(cls, path: Path) -> FileIdentity:
-        """Identity of the file at ``path``."""
-        size = crc = head_crc = 0
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK_BYTES):
-                if not size:
-                    head_crc = zlib.crc32(block[:_HEAD_BYTES])
-                size += len(block)
-                crc = zlib.crc32(block, crc)
-        return cls(size, crc, head_crc)
-
-    def covers(self, other: FileIdentity) -> bool:
-        """Whether a file of the identity ``other`` is this file, or this file without its end."""
-        if self.size == _ANY_SIZE or other.size == 0:
-            return True
-        is_shortened = _HEAD_BYTES <= other.size < self.size and other.head_crc == self.head_crc
-        return is_shortened or self == other
 
 
 @dataclass(eq=False)
@@ -86,7 +66,7 @@ class OutputFolder:
     private: Path
     only: Path | None = None  # the one file of a command whose output is a file
     is_unlisted: bool = False  # no manifest at the start: a new folder, or one of an older version
-    _entries: dict[str, list[FileIdentity]] = field(default_factory=dict)
+    _entries: dict[str, list[_Identity]] = field(default_factory=dict)
     _handle: int = -1  # of the manifest
     _numbers: Iterator[int] = field(default_factory=count)
 
@@ -129,17 +109,13 @@ class OutputFolder:
         status = _read_status(path)
         if status is None or not stat.S_ISREG(status.st_mode):
             return False
-        known = self._entries.get(self._name(path), ())
-        entries = [each for each in known if each.size == _ANY_SIZE or each.size >= status.st_size]
-        if not entries:
-            return False
-        identity = FileIdentity.of(path)
-        return any(entry.covers(identity) for entry in entries)
-
-    def is_shortened(self, path: Path, size: int) -> bool:
-        """Whether the file of ``size`` bytes at ``path`` is one that dhtorch wrote, without its end."""
-        sizes = {entry.size for entry in self._entries.get(self._name(path), ())}
-        return bool(sizes) and not sizes & {size, _ANY_SIZE} and self.owns(path)
+        # A file that is longer than all that dhtorch wrote is not read
+        entries = self._entries.get(self._name(path), ())
+        known = [each for each in entries if each == _ANY_CONTENT or each[0] >= status.st_size]
+        if not known or not status.st_size or _ANY_CONTENT in known:
+            return bool(known)
+        size, _, head_crc = identity = _identify(path)
+        return identity in known or any(_HEAD_BYTES <= size < n and head_crc == head for n, _, head in known)
 
     def remove(self, path: Path) -> bool:
         """Remove the file at ``path`` if dhtorch wrote it and no link leads there -> whether it was removed."""
@@ -152,23 +128,23 @@ class OutputFolder:
             path.unlink()
         return is_own
 
-    def record(self, path: Path, unfinished: Path) -> None:
-        """Enter the file ``unfinished`` in the manifest under its future name ``path``."""
-        self._add([(path, FileIdentity.of(unfinished))])
-
-    def claim(self, path: Path) -> None:
-        """Enter ``path``, which another program writes for the command, with any content.
-
-        Raises:
-            FileExistsError: a link or a foreign file is there.
-        """
-        self.check([path])
-        self._add([(path, FileIdentity(_ANY_SIZE, 0, 0))])
+    def record(self, path: Path, content: Path | None) -> None:
+        """Enter ``path``, before it gets its name, with the content of a file, or, None, with any content."""
+        name, identity = self._name(path), _ANY_CONTENT if content is None else _identify(content)
+        known = self._entries.setdefault(name, [])
+        if identity in known:
+            return
+        known.append(identity)
+        line = (json.dumps([*identity, name]) + "\n").encode()
+        if os.write(self._handle, line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.private / _MANIFEST))
 
     def adopt(self, paths: Iterable[Path]) -> None:
         """Enter existing files, written by an older version without a manifest; links are left out."""
-        regular = [path for path in paths if stat.S_ISREG(getattr(_read_status(path), "st_mode", 0))]
-        self._add([(path, FileIdentity.of(path)) for path in regular if not is_private(Path(self._name(path)))])
+        for path in paths:
+            status = _read_status(path)
+            if status is not None and stat.S_ISREG(status.st_mode) and not is_private(Path(self._name(path))):
+                self.record(path, path)
 
     def new_unfinished(self, suffix: str) -> Path:
         """Path for a file while it is written; such files of a killed process are removed by the next one."""
@@ -207,17 +183,6 @@ class OutputFolder:
             raise ValueError(f"{path}: expected a path below {self.root}")
         return name.as_posix()
 
-    def _add(self, entries: Iterable[tuple[Path, FileIdentity]]) -> None:
-        lines = []
-        for path, identity in entries:
-            known = self._entries.setdefault(self._name(path), [])
-            if identity not in known:
-                known.append(identity)
-                lines.append(json.dumps([*identity, self._name(path)]) + "\n")
-        content = "".join(lines).encode()
-        if content and os.write(self._handle, content) < len(content):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.private / _MANIFEST))
-
     def _open_manifest(self) -> None:
         """Read the manifest; lines that are not valid, as of a torn write, are left out."""
         path = self.private / _MANIFEST
@@ -226,18 +191,11 @@ class OutputFolder:
         self.is_unlisted = not text
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError, RecursionError):
-                *numbers, name = json.loads(line)
-                size, crc, head_crc = (int(x) for x in numbers)
-                self._entries.setdefault(str(name), []).append(FileIdentity(size, crc, head_crc))
+                size, crc, head_crc, name = json.loads(line)
+                self._entries.setdefault(str(name), []).append((int(size), int(crc), int(head_crc)))
         self._handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         if text and not text.endswith("\n"):
             os.write(self._handle, b"\n")
-
-    def _close(self) -> None:
-        os.close(self._handle)
-        self._remove_unfinished()
-        if not self._entries:
-            (self.private / _MANIFEST).unlink(missing_ok=True)
 
     def _remove_unfinished(self) -> None:
         """Remove unfinished files of the private folder, left by a killed process; links are not followed."""
@@ -249,6 +207,9 @@ class OutputFolder:
         with contextlib.suppress(OSError):
             unfinished.rmdir()
 
+
+#: Locks held by this process, to which the system would grant a second lock.
+_locked_paths: set[Path] = set()
 
 #: Folders that this process has open, in the order of opening.
 _open_folders: list[OutputFolder] = []
@@ -305,7 +266,10 @@ def open_output_folder(
                 yield opened
             finally:
                 _open_folders.remove(opened)
-                opened._close()
+                os.close(opened._handle)
+                opened._remove_unfinished()
+                if not opened._entries:
+                    (home / _MANIFEST).unlink(missing_ok=True)
     finally:
         with contextlib.suppress(OSError):  # not empty: files were written, or another process has it open
             home.rmdir()
@@ -356,7 +320,9 @@ def is_whole(path: Path) -> bool:
     if not stat.S_ISREG(status.st_mode) or not status.st_size:
         return False
     folder = find_output_folder(path)
-    return folder is None or not folder.is_shortened(path, status.st_size)
+    entries = () if folder is None else folder._entries.get(folder._name(path), ())
+    is_as_long = any(each == _ANY_CONTENT or each[0] == status.st_size for each in entries)
+    return folder is None or not entries or is_as_long or not folder.owns(path)
 
 
 def is_unfinished(name: str) -> bool:
@@ -385,3 +351,75 @@ def _read_status(path: Path) -> os.stat_result | None:
         return path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return None
+
+
+def _identify(path: Path) -> _Identity:
+    """Identity of the file at ``path``."""
+    size = crc = head_crc = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            head_crc = head_crc if size else zlib.crc32(block[:_HEAD_BYTES])
+            size += len(block)
+            crc = zlib.crc32(block, crc)
+    return size, crc, head_crc
+
+
+@contextlib.contextmanager
+def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
+    """Context that holds the lock ``file``, which is removed at the end.
+
+    The operating system holds the lock (fcntl) and releases it when the owner ends, however it ends. The content of
+    the file (process, host, time) only serves the error message.
+
+    Args:
+        file: lock file; its folder is created if missing.
+        what: option and folder, for the error message.
+
+    Raises:
+        BlockingIOError: another process holds the lock; the message names it and for how long.
+    """
+    path = Path(file).absolute()
+    if fcntl is None:
+        yield
+        return
+    if path in _locked_paths:
+        raise BlockingIOError(f"{what}: found this process already writing there, expected one writer")
+    handle = _open_locked(path, what)
+    _locked_paths.add(path)
+    try:
+        owner = {"process": os.getpid(), "host": socket.gethostname(), "since": time.time()}
+        os.write(handle, json.dumps(owner).encode())
+        yield
+    finally:
+        _locked_paths.discard(path)
+        path.unlink(missing_ok=True)  # before release, so that no newer lock file is removed
+        os.close(handle)
+
+
+def _open_locked(path: Path, what: str) -> int:
+    """Open and lock the file at ``path`` -> descriptor; retries if the file was replaced meanwhile."""
+    assert fcntl is not None
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except FileNotFoundError:  # its owner removed the folder meanwhile
+            continue
+        try:
+            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and path.stat().st_ino == os.fstat(handle).st_ino:
+                os.truncate(handle, 0)  # content left by a dead owner
+                return handle
+        except BlockingIOError:
+            owner = "another dhtorch process"
+            with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError, RecursionError):
+                record = json.loads(os.pread(handle, 1000, 0).decode())
+                age = max(0, round(time.time() - float(record["since"])))
+                host = " ".join(str(record["host"]).split())
+                owner += f" ({int(record['process'])} on {host}, for {age} s)"
+            os.close(handle)
+            raise BlockingIOError(f"{what}: found {owner} writing there, expected one writer at a time") from None
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)  # its owner removed it meanwhile

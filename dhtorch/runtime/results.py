@@ -6,6 +6,7 @@ A result holds the input (``experiment``, ``config``, ``data``), the output (``s
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import json
@@ -24,6 +25,7 @@ from dhtorch.runtime.safe_open import is_inside
 from dhtorch.runtime.storage import (
     compute_file_digest,
     dump_strict_json,
+    has_files,
     parse_strict_json,
     read_utf8,
     replace_file,
@@ -66,7 +68,7 @@ _RESULT_FIELDS: dict[str, Any] = {
 }
 _META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": dict}
 _META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
-#: Fields added later: optional when reading.
+#: Fields added later, or no longer written: optional when reading.
 _ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str, "metrics": list}
 _ADDED_META_FIELDS: dict[str, Any] = {"processor": str, "operators": str, "code": str}
 _DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
@@ -123,39 +125,31 @@ def build_result(
     return dict(result)
 
 
-def compute_seal(result: Mapping[str, Any]) -> str:
-    """SHA-256 over all fields of a result except the seal, to detect changes by hand."""
-    content = {name: value for name, value in result.items() if name != "seal"}
-    return hashlib.sha256(dump_strict_json(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
 def validate_result(result: Any, where: str = "result") -> None:
     """Check a result against schema 1.
 
     Raises:
         ValueError: names the first field that is missing, unknown, of the wrong type or out of range.
     """
-    _check_fields(
-        result,
-        _RESULT_FIELDS | {k: v for k, v in _ADDED_RESULT_FIELDS.items() if isinstance(result, dict) and k in result},
-        where,
-    )
+    _check_fields(result, _RESULT_FIELDS, where, _ADDED_RESULT_FIELDS)
     _expect(result["schema"] == _RESULT_SCHEMA, f"{where}.schema", result["schema"], str(_RESULT_SCHEMA))
-    _check_verdict(result, where)
+    for name in ("question", "expectation", "verdict", "why"):
+        if result["experiment"] in _JOBS_WITHOUT_QUESTION:
+            _expect(result[name] is None, f"{where}.{name}", result[name], "null for this experiment")
+        else:
+            _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
+    if result["experiment"] not in _JOBS_WITHOUT_QUESTION:
+        _expect(result["verdict"] in _VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(_VERDICTS))
     key = result["key"]
     _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
-    added_meta = {
-        k: v for k, v in _ADDED_META_FIELDS.items() if isinstance(result["meta"], dict) and k in result["meta"]
-    }
-    _check_fields(result["meta"], _META_FIELDS | added_meta, f"{where}.meta")
+    _check_fields(result["meta"], _META_FIELDS, f"{where}.meta", _ADDED_META_FIELDS)
     _check_fields(result["data"], _DATA_FIELDS, f"{where}.data")
     for name, entry in result["summary"].items():
         _check_fields(entry, _SUMMARY_FIELDS, f"{where}.summary.{name}")
     for k, metric in enumerate(result.get("metrics", ())):
         _check_fields(metric, _METRIC_FIELDS, f"{where}.metrics.{k}")
     for k, row in enumerate(result["rows"]):
-        optional = {name: kind for name, kind in _OPTIONAL_ROW_FIELDS.items() if isinstance(row, dict) and name in row}
-        _check_fields(row, _ROW_FIELDS | optional, f"{where}.rows.{k}", more=True)
+        _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", _OPTIONAL_ROW_FIELDS, more=True)
         pair = row["pair"]
         is_pair = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
         _expect(is_pair, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
@@ -168,14 +162,8 @@ def write_result(path: str | Path, result: Mapping[str, Any]) -> Path:
     Raises:
         ValueError: the result is not valid; nothing is written.
     """
-    result = {**result, "seal": compute_seal(result)}
     validate_result(result, str(path))
-    return replace_file(path, _format_result(result).encode("utf-8"))
-
-
-def _format_result(result: Mapping[str, Any]) -> str:
-    """Result -> JSON text with one line per summary entry and row: compact, and suited to diff."""
-
+    # Result -> JSON text with one line per summary entry and row: compact, and suited to diff
     lines = []
     for name, value in result.items():
         if name == "rows":
@@ -189,7 +177,7 @@ def _format_result(result: Mapping[str, Any]) -> str:
         else:
             body = dump_strict_json(value)
         lines.append(f" {dump_strict_json(name)}: {body}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
+    return replace_file(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode("utf-8"))
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
@@ -213,10 +201,9 @@ def read_result(path: str | Path) -> dict[str, Any]:
 
 
 def is_finished(path: str | Path, key: str) -> bool:
-    """Whether ``path`` holds a valid, unmodified result of this key, so that the job need not run again."""
+    """Whether ``path`` holds a valid result of this key, so that the job need not run again."""
     try:
-        result = read_result(path)
-        return bool(result["key"] == key and result.get("seal") == compute_seal(result))
+        return bool(read_result(path)["key"] == key)
     except (OSError, ValueError):
         return False
 
@@ -312,17 +299,23 @@ def compute_data_digest(files: Mapping[str, Path | str]) -> str:
     return total.hexdigest()
 
 
-def check_same_run(file: Path, here: Mapping[str, Any], writer: str) -> None:
-    """Check that the metadata of a folder are those of this run.
+def check_same_run(folder: Path, file: Path, here: Mapping[str, Any], writer: str) -> None:
+    """Check that an output folder is empty, or that its metadata are those of this run.
 
     Args:
-        file: JSON that an earlier run wrote.
+        folder: the output folder.
+        file: JSON in it that an earlier run wrote.
         here: metadata of this run, with ``key``.
         writer: the command that writes such files, for the message.
 
     Raises:
-        FileExistsError: the file is damaged, or of other settings, data or code.
+        FileExistsError: other files, a damaged file, or one of other settings, data or code.
     """
+    if not file.is_file():
+        if has_files(folder):
+            expected = "expected an empty folder, or one that this command wrote"
+            raise FileExistsError(f"out: {folder} holds other files, {expected}")
+        return
     try:
         there = parse_strict_json(read_utf8(file))
         difference = "" if there["key"] == here["key"] else describe_difference(there, here)
@@ -354,7 +347,10 @@ def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int, op
 
     ``operators`` is what computes those with compiled kernels: :func:`dhtorch.ops.loader.describe_operators`.
     """
-    versions = {"python": platform.python_version(), **{name: _package_version(name) for name in _PACKAGES}}
+    versions: dict[str, str | None] = {"python": platform.python_version(), **dict.fromkeys(_PACKAGES)}
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "git": read_git_revision(Path(__file__).parents[1]),
@@ -408,8 +404,11 @@ def make_portable(config: Mapping[str, Any], base: str | Path | None = None) -> 
     return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _LOCAL_OPTIONS}
 
 
-def _check_fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:
+def _check_fields(
+    value: Any, kinds: Mapping[str, Any], where: str, optional: Mapping[str, Any] | None = None, more: bool = False
+) -> None:
     _expect(isinstance(value, dict), where, value, "an object")
+    kinds = {**kinds, **{name: kind for name, kind in (optional or {}).items() if name in value}}
     for name, kind in kinds.items():
         if name not in value:
             raise ValueError(f"{where}.{name}: found nothing, expected {_describe_kind(kind)}")
@@ -418,16 +417,6 @@ def _check_fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool =
     unknown = sorted(set(value) - set(kinds))
     if unknown and not more:
         raise ValueError(f"{where}.{unknown[0]}: found an unknown field, expected {', '.join(kinds)}")
-
-
-def _check_verdict(result: Mapping[str, Any], where: str) -> None:
-    for name in ("question", "expectation", "verdict", "why"):
-        if result["experiment"] in _JOBS_WITHOUT_QUESTION:
-            _expect(result[name] is None, f"{where}.{name}", result[name], "null for this experiment")
-        else:
-            _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
-    if result["experiment"] not in _JOBS_WITHOUT_QUESTION:
-        _expect(result["verdict"] in _VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(_VERDICTS))
 
 
 def _is_of_kind(value: Any, kind: Any) -> bool:
@@ -504,13 +493,6 @@ def _shorten_path(path: Path, base: str | Path | None) -> str:
         if resolved != resolved_base and resolved.is_relative_to(resolved_base):
             return resolved.relative_to(resolved_base).as_posix()
     return resolved.name
-
-
-def _package_version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def read_git_revision(folder: Path) -> str | None:

@@ -114,17 +114,6 @@ def write_json(path: str | Path, value: Any) -> Path:
     return replace_file(path, (dump_strict_json(value, indent=1) + "\n").encode("utf-8"))
 
 
-@contextlib.contextmanager
-def _add_path_to_errors(path: Path) -> Iterator[None]:
-    """Context that adds ``path`` to an OSError without a file name (full disk, file size limit)."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is not None or error.errno is None:
-            raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
 def replace_file(path: str | Path, content: bytes) -> Path:
     """Write a file atomically: ``path`` holds either its old content or all of the new content."""
     path = Path(path)
@@ -137,10 +126,16 @@ def replace_file(path: str | Path, content: bytes) -> Path:
 def write_atomically(path: str | Path) -> Iterator[IO[bytes]]:
     """Context with an open file, which gets the name ``path`` at the end; nothing is left if the block fails."""
     path = Path(path)
-    with replace_at_end(path) as unfinished, _add_path_to_errors(path), unfinished.open("wb") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
+    with replace_at_end(path) as unfinished:
+        try:
+            with unfinished.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            if error.filename is not None or error.errno is None:
+                raise
+            raise OSError(error.errno, error.strerror, str(path)) from error  # full disk, file size limit
 
 
 @contextlib.contextmanager
@@ -157,7 +152,13 @@ def replace_at_end(path: str | Path) -> Iterator[Path]:
     if folder is not None:
         folder.check([path])
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = _name_unfinished(path) if folder is None else folder.new_unfinished(path.suffix)
+    if folder is not None:
+        unfinished = folder.new_unfinished(path.suffix)
+    else:  # beside the file, with a name that is no longer than that of the file may be
+        prefix = f".{path.name[:_UNFINISHED_NAME_CHARACTERS]}."
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=output_folder.UNFINISHED_SUFFIX, dir=path.parent)
+        os.close(handle)
+        unfinished = Path(name)
     try:
         yield unfinished
         unfinished.chmod(_FILE_MODE)
@@ -167,16 +168,12 @@ def replace_at_end(path: str | Path) -> Iterator[Path]:
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
-
-
-def _name_unfinished(path: Path) -> Path:
-    """A new file beside ``path``, whose name is no longer than that of ``path`` may be."""
-    handle, name = tempfile.mkstemp(
-        prefix=f".{path.name[:_UNFINISHED_NAME_CHARACTERS]}.", suffix=output_folder.UNFINISHED_SUFFIX, dir=path.parent
-    )
-    os.close(handle)
-    return Path(name)
+    with contextlib.suppress(OSError):  # so that the rename is durable, where the system can open folders
+        handle = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def compute_file_digest(path: Path) -> str:
@@ -211,9 +208,10 @@ def copy_file(source: str | Path, path: str | Path) -> Path:
 
 def has_files(folder: Path) -> bool:
     """Whether a folder or its subfolders hold a file, unfinished files and dhtorch's own records excluded."""
-    inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    files = (entry for entry in inside if not output_folder.is_private(entry.relative_to(folder)))
-    return any(not output_folder.is_unfinished(f.name) for f in files)
+    files = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    return any(
+        not (output_folder.is_private(f.relative_to(folder)) or output_folder.is_unfinished(f.name)) for f in files
+    )
 
 
 def _reject_constant(word: str) -> None:
@@ -226,17 +224,3 @@ def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
         raise ValueError(f"the key {next(n for n in names if names.count(n) > 1)!r} twice")
     return members
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a folder to disk, so that a rename is durable, where the system can open folders."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    except OSError:
-        pass
-    finally:
-        os.close(handle)

@@ -11,14 +11,12 @@ from support import box_scene as box
 from support import textured_box, writers
 from support.stated_poses import poses_of, state_poses, with_poses
 
-from dhtorch import data
 from dhtorch.cli import capture_checks, inspect, process_capture, recover_page
 from dhtorch.cli.capture_checks import check_data, check_scene, print_check
 from dhtorch.codes import Source
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, Scenes
-from dhtorch.data.survey import Survey
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
@@ -67,23 +65,22 @@ def test_a_recording_is_checked_and_its_report_has_all_lines(checked, tmp_path, 
     assert out == "" and err.splitlines() == [f"box: {ASSUMED}", "box: a frame was left out"]
 
 
-def test_notes_of_a_scene_are_kept(checked, tmp_path):
+def test_notes_of_a_scene_are_kept_and_recordings_that_are_not_from_disk_left_alone(checked, tmp_path):
     with pytest.warns(UserWarning, match="contradict"):
         scene = check_data(Scene(recording(tmp_path), near=1.5, gap=4))
     assert (scene.near, scene.gap, scene.recording.poses) == (1.5, 4, None)
-
-
-def test_quiet_prints_no_notes_but_warns(tmp_path, capsys, monkeypatch):
-    check = CaptureCheck(recording(tmp_path), ASSUMED, (FINDING,))
-    monkeypatch.setattr(capture_checks, "get_verbosity", lambda: "quiet")
-    with pytest.warns(UserWarning, match="^name: poses"):
-        print_check("name", check)
-    assert capsys.readouterr() == ("", "")
-
-
-def test_recordings_that_are_not_from_disk_are_left_alone(checked):
+    checked.clear()
     scene = Scene(recording(None))
     assert check_scene(scene) is scene and checked == []
+
+
+@pytest.mark.parametrize("level", ["quiet", "normal"])
+def test_quiet_prints_no_notes_but_warns(tmp_path, capsys, monkeypatch, level):
+    monkeypatch.setenv(console._VERBOSITY_VARIABLE, level)
+    with pytest.warns(UserWarning, match="^name: poses"):
+        print_check("name", CaptureCheck(recording(tmp_path), ASSUMED, (FINDING,)))
+    notes = f"name: {ASSUMED}\nname: a frame was left out\n"
+    assert capsys.readouterr() == ("", "" if level == "quiet" else notes)
 
 
 def test_a_list_is_checked_up_to_its_first_dozen(checked, tmp_path):
@@ -145,18 +142,20 @@ def refuted(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_inspect_shows_unit_agreement_and_findings(refuted):
-
-    survey = Survey("walk", "frames_dir")
-    inspect.add_check(survey, data.open(refuted))
+@pytest.mark.parametrize(
+    ("options", "unit", "warned"),
+    [
+        ({}, ASSUMED, True),
+        ({"pose_convention": "opengl", "depth_unit": "mm"}, "depth unit: 1/1000 m (option depth_unit)", False),
+    ],
+)
+def test_inspect_shows_unit_agreement_and_findings(refuted, options, unit, warned):
+    (survey,) = inspect.survey_capture(inspect.FoundCapture(refuted, "recording", "frames_dir", "", options=options))
     facts = dict(survey.facts)
-    assert facts["unit"] == ASSUMED
-    assert "agree to" in facts["depth and poses"] and "% without poses" in facts["depth and poses"]
-    (warning,) = survey.warnings
-    assert "OpenGL camera axes" in warning and "remedy: data.pose_convention=opengl" in warning
-    corrected = Survey("walk", "frames_dir")
-    inspect.add_check(corrected, data.open(refuted, pose_convention="opengl", depth_unit="mm"))
-    assert corrected.warnings == [] and dict(corrected.facts)["unit"] == "depth unit: 1/1000 m (option depth_unit)"
+    assert facts["unit"] == unit and "% without poses" in facts["depth and poses"]
+    assert "agree to" in facts["depth and poses"]
+    found = [text for text in survey.warnings if "OpenGL camera axes" in text]
+    assert [text.endswith("(remedy: data.pose_convention=opengl)") for text in found] == [True] * warned
 
 
 @pytest.mark.slow
@@ -203,41 +202,21 @@ def test_motions_are_chained_from_the_first_frame():
     torch.testing.assert_close(se3.to_matrix(placed[2:3])[0], torch.eye(4, dtype=torch.float64))
 
 
-def test_usable_poses_are_kept():
+def test_usable_poses_are_kept_and_the_page_states_what_joins_the_map():
     true = poses_of(box.walk(6, hw=(2, 2)))
     whole = recovered({2: {}, 0: {}, 4: {}}, poses=true)
     assert process_capture._place_frames(whole) is whole.task.recording
-    assert (
-        recover_page.describe_placing(CaptureCheck(whole.task.recording), whole.task.recording, whole.task.recording)
-        == []
-    )
-
-
-def test_the_sentence_on_joining_names_the_reason():
-    true = poses_of(box.walk(6, hw=(2, 2)))
-    none = recovered({2: {}, 0: {}, 4: {}}).task.recording
-    placed = replace(none, poses=true)
-    sound, bad = CaptureCheck(none), CaptureCheck(none, findings=(FINDING,))
-    (line,) = recover_page.describe_placing(sound, none, placed)
-    assert line == "The map is joined by the motion that near returns give (6 frames): the capture has no poses."
-    assert recover_page.describe_placing(bad, none, placed)[0].endswith("the stated poses are refuted.")
-
-
-def test_sentences_of_the_page():
-    none = recovered({2: {}, 0: {}, 4: {}}).task.recording
+    none = replace(whole.task.recording, poses=None)
+    said = "The map is joined by the motion that near returns give (6 frames): "
+    for check, stated, lines in (
+        (CaptureCheck(whole.task.recording), whole.task.recording, []),
+        (CaptureCheck(none), none, [f"{said}the capture has no poses."]),
+        (CaptureCheck(none, findings=(FINDING,)), none, [f"{said}the stated poses are refuted."]),
+    ):
+        assert recover_page.describe_placing(check, stated, replace(none, poses=true)) == lines
     lines = recover_page.describe_check(CaptureCheck(none, ASSUMED, (FINDING,)))
     assert lines == [f"D{ASSUMED[1:]}.", f"Warning: {FINDING}."]
     assert recover_page.describe_check(CaptureCheck(none)) == []
-
-
-def test_verbosity_is_read_when_printing(tmp_path, capsys, monkeypatch):
-    """The environment variable of ``--quiet`` silences the notes."""
-    monkeypatch.setenv(console._VERBOSITY_VARIABLE, "quiet")
-    print_check("name", CaptureCheck(recording(tmp_path), ASSUMED))
-    assert capsys.readouterr().err == ""
-    monkeypatch.setenv(console._VERBOSITY_VARIABLE, "normal")
-    print_check("name", CaptureCheck(recording(tmp_path), ASSUMED))
-    assert f"name: {ASSUMED}" in capsys.readouterr().err
 
 
 def scores(stated):

@@ -5,9 +5,7 @@ import inspect
 import io
 import json
 import shutil
-import signal
 import struct
-import sys
 from functools import cache
 
 import hydra
@@ -17,10 +15,9 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 from support import writers
-from support.processes import start, stop
 
 from dhtorch import MAP, data, export
-from dhtorch.cli import complete, layouts, run
+from dhtorch.cli import complete, run
 from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import candidate_frames
@@ -30,7 +27,6 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import completion, dense
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
-from dhtorch.records import DepthMap, SigmaBudget
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -188,7 +184,7 @@ def test_a_tum_sequence_stays_one_with_its_own_step_and_stamps(captures, tmp_pat
         for kind in ("source", "depth", "sigma")
     )
     recovered, filled, sensor = (np.isin(source, codes) for codes in ([2, 3], [5], [1]))
-    median = np.median(sigma[recovered] / layouts.SIGMA_STEPS_PER_DEPTH_STEP / depth[recovered])
+    median = np.median(sigma[recovered] / completed.SIGMA_STEPS_PER_DEPTH_STEP / depth[recovered])
     counts = f"recovered {recovered.mean():.1%} (median sigma {median:.1%} of the depth)"
     assert f"{counts}, filled {filled.mean():.1%}, sensor {sensor.mean():.1%}, no answer" in out and filled.any()
     there, back = data.open(captures / "stamped"), data.open(tmp_path / "maps")
@@ -274,19 +270,6 @@ def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, mon
     assert len(data.open(numbered)) == 4 and (numbered / "depth" / "000002.png").is_file()
 
 
-def test_leftovers_of_a_killed_run_are_removed(captures, tmp_path):
-    out = tmp_path / "maps"
-    said(captures / "numbered", out, max_frames=2)
-    meta, depth = out / "meta" / "000001.json", out / "depth" / "000001.png"
-    meta.write_bytes(meta.read_bytes()[:100])
-    depth.write_bytes(depth.read_bytes()[:100])
-    (out / ".dhtorch" / "unfinished").mkdir()
-    (out / ".dhtorch" / "unfinished" / "0.png").write_bytes(b"half")
-    said(captures / "numbered", out, max_frames=1)
-    kept = {p.name for p in out.rglob("*") if p.is_file() and p.name != "manifest"}
-    assert kept == {"000000.png", "000000.json", "complete.json", "K.txt", "meta.json", "poses.txt"}
-
-
 def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
     def stopped(items, *_):
         yield items[0]
@@ -301,27 +284,6 @@ def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
     before = stamps(tmp_path)
     assert "(1 left untouched)" in said(captures / "numbered", tmp_path, max_frames=2)
     assert stamps(tmp_path)["depth/000000.png"] == before["depth/000000.png"] and len(data.open(tmp_path)) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_process_loses_the_frame_that_was_being_made(captures, tmp_path, how):
-    out = tmp_path / "maps"
-    words = ["complete", str(captures / "numbered"), f"out={out}", "planes=16", "method=map", "method.n=256"]
-    code = stop(start(tmp_path, *words), lambda: list((out / "meta").glob("*.json")), 1, how)
-    there = {p.stem for p in (out / "meta").glob("*.json")}
-    assert 1 <= len(there) < 4
-    if how == signal.SIGINT:
-        err = (tmp_path / "err").read_text()
-        lines = [line for line in err.strip().splitlines() if "depth unit assumed" not in line]
-        assert code == 130 and len(lines) == 1, err
-        assert f"{len(there)} of 4 frames" in err and "run the same command again for the rest" in err
-        assert len(data.open(out)) == len(there), "a recording even so"
-    before = stamps(out)
-    assert run.main(words) == 0
-    after = stamps(out)
-    assert all(after[f"depth/{name}.png"] == before[f"depth/{name}.png"] for name in there) and len(data.open(out)) == 4
 
 
 def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
@@ -346,45 +308,21 @@ def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
 @pytest.mark.parametrize(
     ("option", "said_of_it"),
     [
-        ({"max_frames": 0}, "max_frames: found 0"),
-        ({"every": -1}, "every: found -1"),
         ({"format": "zip"}, "format: found 'zip', expected one of auto, frames, tum, stray, png"),
         ({"format": "tum"}, "format=tum: numbered has no time stamps"),
         ({"format": "stray"}, "numbered is a frames_dir recording, not a Stray"),
         ({"unit": 0}, "unit: found 0"),
         ({"unit": 1}, "unit: found 1"),
-        ({"cutoff": -2}, "cutoff: found -2"),
-        ({"dtype": "int8"}, "dtype: found 'int8'"),
-        ({"device": "gpu"}, "device: found 'gpu'"),
-        ({"figures": "some"}, "figures: found 'some', expected one of false, true, all"),
-        ({"min_correlation": 2}, "min_correlation: found 2"),
         ({"steps": []}, "steps: found none"),
         ({"source_views": 0}, "source_views is 0"),
         ({"size": 3}, "size is 3"),
+        ({"sensor": "kinect"}, "sensor: found 'kinect', expected one of"),
     ],
 )
 def test_bad_options_are_named_and_leave_nothing(captures, tmp_path, option, said_of_it):
     with pytest.raises(ValueError, match=said_of_it):
         said(captures / "numbered", tmp_path / "maps", **option)
     assert not (tmp_path / "maps").exists()
-
-
-def test_the_command_takes_a_path_and_ends_bad_input_in_one_line(captures, tmp_path, capsys):
-    words = [
-        "complete",
-        str(captures / "numbered"),
-        f"out={tmp_path / 'maps'}",
-        "max_frames=1",
-        "method=map",
-        "method.n=256",
-    ]
-    assert run.main([*words, "planes=16", "figures=false"]) == 0
-    assert "1 frame of 160x120" in capsys.readouterr().out and len(data.open(tmp_path / "maps")) == 1
-    for bad in (["planes=24"], ["siez=3"]):
-        assert run.main([*words, *bad]) == 2
-        *notes, error = capsys.readouterr().err.strip().splitlines()
-        assert error.startswith("dhtorch: ") and bad[0].split("=")[0] in error
-        assert notes in ([], ["numbered: depth unit assumed: 1/1000 m (data.depth_unit= sets it)"])
 
 
 def test_a_broken_frame_ends_it_and_the_others_stay(captures, tmp_path):
@@ -420,19 +358,6 @@ def test_several_scenes_have_a_folder_each_and_a_name_once(room, tmp_path):
         said([made[0], made[0]], tmp_path)
 
 
-def test_sparse_depth_has_longer_steps_and_pictures_are_asked_for(room):
-    poses = room.poses
-    sparse = Recording("sweep", "driving", room.load, room.number, poses=poses, sparse=True)
-    assert layouts.select_layout(sparse, "auto", None, same=True).unit == 0.005
-    assert layouts.select_layout(sparse, "auto", 0.002, same=True).unit == 0.002
-    tum = Recording("t", "tum", room.load, room.number, poses=poses, times=room.times)
-    assert layouts.select_layout(tum, "auto", None, same=True).name == "tum"
-    assert layouts.select_layout(tum, "auto", None, same=False).name == "frames", "K there is of the pictures"
-    stray = Recording("s", "stray", room.load, room.number, poses=poses)
-    with pytest.raises(ValueError, match=r"unit: found 0\.002, expected 0\.001 m"):
-        layouts.select_layout(stray, "auto", 0.002, same=False)
-
-
 def test_the_sweeps_options_have_the_functions_defaults():
     defaults = {k: p.default for k, p in inspect.signature(completion.complete_depth).parameters.items()}
     settings = composed()
@@ -456,16 +381,4 @@ def test_budget_files_hold_the_largest_cause_and_sigma_follows_a_stated_sensor(c
     row = json.loads((out / "meta" / "000000.json").read_text())
     assert np.abs(sigma[sensed] * row["sigma_unit_m"] - 0.02).max() < row["sigma_unit_m"]
     assert list(row["sigma_shares"]) == ["track", "pose", "reference", "lens", "model"]
-    with pytest.raises(ValueError, match="sensor: found 'kinect', expected one of"):
-        said(captures / "numbered", tmp_path / "wrong", sensor="kinect")
-
-
-def test_shares_of_sigma_are_those_of_estimated_pixels():
-    source = torch.tensor([[Source.SENSOR, Source.SWEPT, Source.SWEPT, Source.FILLED, Source.NONE]], dtype=torch.int32)
-    sigma = torch.tensor([[1.0, 2.0, 1.0, 1.0, torch.nan]])
-    terms = [torch.tensor([x]) for x in ([0.0, 3, 0, 0, 0], [0.0, 1, 1, 0, 0], *[[0.0] * 5] * 3)]
-    gate = torch.tensor([[Gate.ANSWER] * 4 + [Gate.NO_TRACK]], dtype=torch.int32)
-    causes, shares = complete._summarise_budget(DepthMap(3 * sigma, sigma, sigma, source, gate, SigmaBudget(*terms)))
-    assert causes.tolist() == [[3, 1, 2, 5, 0]] and causes.dtype == np.uint8
-    expected = {"track": 0.25, "pose": 0.25 / 3 + 1 / 3, "reference": 0.0, "lens": 0.0, "model": 1 / 3}
-    assert shares == pytest.approx(expected)
+    assert sum(row["sigma_shares"].values()) == pytest.approx(1) and min(row["sigma_shares"].values()) >= 0

@@ -12,11 +12,10 @@ from PIL import Image
 from support import stored_outputs, writers
 
 from dhtorch.cli.completed_folder import count_pixels
-from dhtorch.cli.process_capture import order_evenly
 from dhtorch.cli.run import main
 from dhtorch.metrics.holdout import range_split
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.viz.plots import colours, format_capture_name
+from dhtorch.viz.plots import colours
 
 SMALL = ["method=map", "method.n=256", "planes=32", "steps=[1]", "mesh=false", "threads=1"]
 
@@ -141,13 +140,6 @@ def test_a_frame_that_cannot_be_read_is_left_out_and_named(capture, tmp_path, ca
     assert len(list((tmp_path / "out/meta").iterdir())) == 2
 
 
-def refusal(words, capsys):
-    assert main([str(w) for w in words]) == 2
-    said = capsys.readouterr()
-    assert not said.out and said.err.startswith("dhtorch: ") and said.err.count("\n") == 1
-    return said.err
-
-
 @pytest.mark.slow
 def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp_path, capsys):
     room = SyntheticRoom(hw=(48, 64), n_frames=3)
@@ -156,36 +148,3 @@ def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp
     assert main([str(tmp_path / "both"), f"out={tmp_path / 'out'}", "minutes=0.01", *SMALL]) == 0
     said = capsys.readouterr().out
     assert "kitchen" in said and "alone: depth without images" in said and (tmp_path / "out/overview.png").is_file()
-
-
-def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
-    single = tmp_path / "single"
-    single.mkdir()
-    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(single / "a.png")
-    assert "1 picture without depth" in refusal([single], capsys)
-    Image.fromarray(np.full((20, 30), 900, np.uint16)).save(single / "b.png")
-    assert "one frame" in refusal([single], capsys)
-    (tmp_path / "empty").mkdir()
-    assert "found an empty folder" in refusal([tmp_path / "empty"], capsys)
-    assert "is inside the capture" in refusal([capture, f"out={capture}/out"], capsys)
-    assert refusal([capture, "minutes=-1"], capsys).startswith("dhtorch: minutes: found -1, expected")
-    alone = tmp_path / "alone"
-    room = SyntheticRoom(hw=(48, 64), n_frames=3)
-    writers.write_stray(alone, list(room), video=False)
-    assert "depth without images" in refusal([alone], capsys)
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 40, 777])
-def test_frames_are_spread_over_the_capture_after_every_one(n):
-    order = order_evenly(n)
-    assert sorted(order) == list(range(n)) and order[0] == n // 2
-    assert {0, n - 1} <= set(order[:3])
-    for k in range(4, n):
-        done = np.array(sorted(order[:k]))
-        assert np.diff(done).max() <= max(2.6 * n / k, 2), (k, "no part is left out")
-        assert abs((done < n / 2).sum() - k / 2) <= 2 + 0.02 * k, (k, "no half waits for the other")
-
-
-def test_names_of_captures_are_titles():
-    names = {"kitchen_scan": "Kitchen scan", "living-room": "Living room", "2024-01-31": "2024-01-31", "küche": "Küche"}
-    assert {name: format_capture_name(name) for name in names} == names

@@ -1,7 +1,6 @@
 """Sweeps: what is finished stays, what is not is done, whatever stopped it; one failing job stops no other."""
 
 import importlib.util
-import json
 import os
 import re
 import shlex
@@ -20,7 +19,7 @@ from support import writers
 from support.processes import start, stop
 
 from dhtorch.cli import job
-from dhtorch.cli.run import config_dir, job_name, main
+from dhtorch.cli.run import config_dir, job_name
 from dhtorch.experiments.protocol import Outcome
 from dhtorch.runtime import console
 from dhtorch.runtime import results as result_files
@@ -52,18 +51,6 @@ def seen(paths):
 def asked(path):
     result = result_files.read_result(path)
     return next(r["method"] for r in result["rows"]), result["config"]["seed"]
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """The command in this process, from an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*args):
-        code = main(list(args))
-        return (code, *capsys.readouterr())
-
-    return call
 
 
 @pytest.mark.slow
@@ -107,7 +94,10 @@ def test_an_interrupted_sweep_says_how_to_go_on(tmp_path, command, monkeypatch):
     code, _, err = command("-m", *SIX)
     assert code == 130 and "Traceback" not in err and "interrupted" in err
     before = seen(results(tmp_path))
-    assert len(before) == 2 and all(result_files.read_result(p) for p in before)
+    assert len(before) == 2
+    for path in before:
+        config = result_files.read_result(path)["config"]
+        assert f"seed={config['seed']}" in path.parent.name and "output" not in config and "hydra" not in config
     program, *words = shlex.split(err.strip().splitlines()[-1])
     assert program == "dhtorch"
     code, out, err = command(*words)
@@ -147,12 +137,6 @@ def test_an_unforeseen_error_is_one_failed_job(command, monkeypatch):
     code, out, err = command("-m", *TINY, "seed=0,1")
     assert code == 1 and "1 finished, 0 left untouched, 1 failed" in out
     assert "Traceback" in err and "failed: seed=0: ZeroDivisionError: a bug" in err
-
-
-def test_a_wrong_option_of_one_job_fails_before_any_runs(command, tmp_path):
-    for wrong in (["method=paper,opencvv"], ["method.n=512,x", "sede=1"]):
-        code, _, err = command("-m", *wrong)
-        assert code == 2 and len(err.strip().splitlines()) == 1 and not results(tmp_path), err
 
 
 @pytest.mark.slow
@@ -203,7 +187,7 @@ def test_a_broken_launcher_says_how_to_go_on(command, monkeypatch):
     assert {"-m", "resume=true", "seed=0,1", *TINY} <= set(words) and any(w.startswith("output=") for w in words)
 
 
-@pytest.mark.parametrize("name", LAUNCHERS)
+@pytest.mark.parametrize("name", [p.stem for p in (config_dir() / "launch").glob("*.yaml")])
 def test_launchers_compose(name):
     plugin = LAUNCHERS[name]
     if plugin and importlib.util.find_spec(f"hydra_plugins.{plugin}") is None:
@@ -217,15 +201,6 @@ def test_launchers_compose(name):
     assert {k: launcher[k] for k in wanted} == wanted and "launch" not in cfg
 
 
-def test_every_launcher_is_tried():
-    assert {p.stem for p in (config_dir() / "launch").glob("*.yaml")} == set(LAUNCHERS)
-
-
-def test_a_missing_launcher_names_the_extra(command):
-    code, _, err = command("-m", "hydra/launcher=nowhere", *TINY, "seed=0,1")
-    assert code == 2 and "dhtorch[scale]" in err and len(err.strip().splitlines()) == 1
-
-
 @pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.text(min_size=1), min_size=2, max_size=2, unique=True))
@@ -236,13 +211,18 @@ def test_names_of_jobs_are_safe_short_and_different(texts):
         assert re.fullmatch(r"[\w.,=+~@-]{1,120}", name, re.ASCII) and name not in (".", "..")
 
 
-def test_names_of_jobs_can_be_read(monkeypatch):
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("method=paper,seed=0", "method=paper,seed=0"),
+        ("", "defaults"),
+        ("data.hw=[120,160],seed=0", "data.hw=120,160,seed=0-"),
+        ("data.root=/sets/tum", "data.root=tum"),
+    ],
+)
+def test_names_of_jobs_can_be_read(monkeypatch, text, name):
     monkeypatch.setenv("DHTORCH_DATA", "/sets/")
-    assert job_name("method=paper,seed=0") == "method=paper,seed=0"
-    assert job_name("") == "defaults"
-    assert job_name("data.hw=[120,160],seed=0").startswith("data.hw=120,160,seed=0-")
-    monkeypatch.setenv("DHTORCH_DATA", "/elsewhere")
-    assert job_name("data.root=/elsewhere/tum") == job_name("data.root=tum")
+    assert job_name(text)[: len(name)] == name and len(job_name(text)) == len(name) + 8 * name.endswith("-")
 
 
 @pytest.mark.slow
@@ -296,11 +276,3 @@ def test_only_our_own_warnings_are_seen(monkeypatch, asked):
             for module in modules:
                 warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
     assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pipeline.pair"])
-
-
-@pytest.mark.slow
-def test_the_result_is_strict_json_of_its_own_job(command, tmp_path):
-    assert command("-m", "output=sweep", *TINY, "seed=0,1")[0] == 0
-    for path in results(tmp_path):
-        config = json.loads(path.read_text())["config"]
-        assert f"seed={config['seed']}" in path.parent.name and "output" not in config and "hydra" not in config

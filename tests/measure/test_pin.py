@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import dhtorch
-from dhtorch.cli.pin_words import describe_pin, guide_pin
+from dhtorch.cli.pin import describe_pin, guide_pin
 from dhtorch.codes import PinReason, PinVerdict
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix

@@ -25,7 +25,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from dhtorch import export
-from dhtorch.cli import errors, pin
+from dhtorch.cli import pin
 from dhtorch.cli import run as commands
 from dhtorch.data.codecs.exr import read_exr
 from dhtorch.data.depth_maps import open_depth_maps
@@ -197,7 +197,7 @@ def read_settings(path: Path) -> None:
     except FormatError:
         raise
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError, OSError, ImportError) as error:
-        text = errors.format_error(errors.unwrap_cause(error))
+        text = commands.format_error(commands.unwrap_cause(error))
         assert text and "\n" not in text
         raise FormatError(path, "settings", text, "as documented") from None
 
@@ -240,7 +240,7 @@ def read_enriched(path: Path) -> None:
     if shared.is_file():
         here = {"key": "another", "config": {}, "data": {"digest": ""}, "git": "x"}
         with contextlib.suppress(FileExistsError):
-            result_files.check_same_run(shared, here, "enrich")
+            result_files.check_same_run(path, shared, here, "enrich")
     camera = DatasetCamera("observation.images.front", (48, 64), (48, 64), posed=True)
     options = {"origin": None, "numbers": [0], "step": 0.0, "maps": ("depth",), "as_images": False, "fps": 30.0}
     target = LeRobotTarget(path, 3, {camera.key: camera}, **options, task=None, key="another")

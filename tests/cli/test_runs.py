@@ -1,0 +1,529 @@
+"""Whole runs of the command: files and printed text of a job, verbosity, progress, signals, sweeps, the demo."""
+
+import csv
+import errno
+import io
+import json
+import logging
+import os
+import re
+import resource
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support import writers
+from support.tiny_runs import ROOM, TINY
+
+from dhtorch.cli import inspect as capture
+from dhtorch.cli import process_capture, run
+from dhtorch.cli import sweep_state as together
+from dhtorch.codes import Source
+from dhtorch.experiments.outcome import DEPTH_METRICS
+from dhtorch.experiments.report import advice, jobs, page
+from dhtorch.runtime import console, storage
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.output_folder import open_output_file
+from dhtorch.runtime.ply import read_ply_vertices
+from dhtorch.synthetic import recording as rooms
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.viz.viewer import html
+
+#: What Windows refuses in a name, and the names that it keeps for itself.
+REFUSED = re.compile(r'[<>:"|?*\\\x00-\x1f]|[. ]$')
+RESERVED = {"con", "prn", "aux", "nul", *(f"{d}{k}" for d in ("com", "lpt") for k in range(10))}
+CALL = "import json, sys; from dhtorch.cli.run import main; print('\\x00', [main(a) for a in json.loads(sys.argv[1])])"
+
+
+def small_room(n=3, **options):
+    return SyntheticRoom(**{"hw": (60, 80), "n_frames": n, "lidar": "exact", "supersample": 1, **options})
+
+
+def process(folder, *calls, **options):
+    """The command once for each of the calls, in one process of its own."""
+    env = {k: v for k, v in os.environ.items() if k not in ("DHTORCH_DATA", console._VERBOSITY_VARIABLE)}
+    call = [sys.executable, "-c", CALL, json.dumps(calls)]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.run(call, cwd=folder, env=env, text=True, timeout=550, check=False, **options)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Two small captures side by side."""
+    folder = tmp_path_factory.mktemp("captures")
+    for name in ("one", "two"):
+        writers.write_counted_frames(folder / name, list(small_room()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ran(frames, tmp_path_factory):
+    """Every command once, in one process of its own from an empty folder: the folder, and how the process ended."""
+    folder = tmp_path_factory.mktemp("words")
+    calls = [
+        ["data.hw=[120,160]", "data.n_frames=3", "pairs.gap=2", "method.n=1024", "output=job"],
+        ["inspect", str(frames / "one"), "--out", "sheets"],
+        ["report", "job"],
+        ["report", "job", "--markdown"],
+        ["report", "job", "--html", "page.html"],
+        ["integrate", *ROOM, "voxel=0.1", "mesh=false", "output=map"],
+        ["extract", *ROOM[:-1], "data.gap=2", "extract.tokens_hw=[56,70]", "out=features"],
+        ["view", "job", "html=view.html"],
+    ]
+    return folder, process(folder, *calls)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
+def test_a_run_of_any_command_prints_no_warning_and_files_have_names_for_every_system(ran):
+    folder, done = ran
+    assert done.stderr == "" and done.stdout.partition("\x00")[2].strip() == str([0] * 8)
+    names = {part for p in folder.rglob("*") for part in p.relative_to(folder).parts}
+    assert len(names) >= 15
+    for name in names:
+        assert not REFUSED.search(name) and name.split(".")[0].lower() not in RESERVED, name
+    for text in ("data.root=C:\\data\\x,seed=1", "a=b|c", "k='x y'", "x=1.", "data.root=/a/b:c", "q=*?<>"):
+        assert not REFUSED.search(run.job_name(text)), run.job_name(text)
+
+
+@pytest.mark.slow
+def test_one_job_writes_one_result_its_figures_and_points(ran):
+    folder, done = ran
+    job = folder / "job"
+    result = result_files.read_result(job)
+    assert result["experiment"] == "pair" and result["data"]["n_pairs"] == 1
+    assert {p.name for p in job.rglob("*") if p.is_file()} == {
+        "manifest", "result.json", "completed.png", "samples.png", "holes.png", "depth.png", "risk_coverage.png", "points.ply",
+    }  # fmt: skip
+    words = ("coverage", "median", "p90", "corr", "residual", "pose found", f"wrote {job / 'result.json'}", "| scene")
+    assert all(word in done.stdout for word in words), done.stdout
+    others = [p.stat().st_mtime_ns for p in job.rglob("*.*") if p.name != "result.json" and p.is_file()]
+    assert (job / "result.json").stat().st_mtime_ns >= max(others), "written last: with it the job is whole"
+    assert [r["pair"] for r in result["rows"]] == [[0, 2], None]
+    names = {"coverage", "median_rel", "p90_rel", "corr", "residual_px", "pnp_success", "aurc", "ece"}
+    text = (job / "result.json").read_text()
+    assert names <= set(result["summary"]) and str(Path.home()) not in text and str(folder) not in text
+    points = read_ply_vertices(next(job.rglob("points.ply"))).vertex
+    assert len(points) > 50 and set(points["source"]) <= {1, 2} and 1 in points["source"]
+    assert (points["z"] > 0.2).all() and (points["z"] < 50).all()
+    assert points.dtype.names == (*"xyz", "red", "green", "blue", "sigma", "score", "class", "source", "quality")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+def test_a_reader_that_leaves_is_no_error(ran):
+    code = "import sys; from dhtorch.cli.run import main; sys.exit(main(['report', 'job', '--markdown']))"
+    read, write = os.pipe()
+    os.close(read)
+    call = [sys.executable, "-c", code]
+    done = subprocess.run(call, cwd=ran[0], stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_broken_file_is_one_line_from_a_worker_too(command, tmp_path, workers):
+    writers.write_counted_frames(tmp_path / "set", list(small_room()))
+    image = tmp_path / "set" / "images" / "00001.png"
+    image.write_bytes(image.read_bytes()[:200])
+    words = ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=1", "data.near=2.0", "figures=false"]
+    if workers:
+        done = process(tmp_path, [*words, f"workers={workers}"])
+        code, err = int(done.stdout.partition("\x00")[2].strip(" []\n")), done.stderr
+    else:
+        code, _, err = command(*words)
+    assert code == 2 and len(err.strip().splitlines()) == 1, err
+    assert "00001.png" in err and "Traceback" not in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pairs", [["pairs=time", "pairs.seconds=0.06"], ["pairs=baseline", "pairs.metres=0.04"]])
+def test_pairs_by_time_and_by_baseline(command, tmp_path, pairs):
+    code, _, err = command("data.hw=[120,160]", "data.n_frames=3", "method.n=1024", *pairs, "figures=false", "output=o")
+    assert code == 0, err
+    assert result_files.read_result(tmp_path / "o")["data"]["n_pairs"] >= 1
+
+
+@pytest.mark.slow
+def test_batches_and_workers_give_the_same_rows(tmp_path):
+    words = ["data.hw=[120,160]", "data.n_frames=5", "pairs.gap=2", "method.n=1024", "figures=false"]
+    process(tmp_path, [*words, "batch=1", "output=0"], [*words, "batch=2", "workers=2", "output=1"])
+    rows = [result_files.read_result(tmp_path / str(k))["rows"] for k in range(2)]
+    plain = [[{k: v for k, v in row.items() if k != "ms"} for row in each] for each in rows]
+    assert plain[0] == plain[1]
+
+
+# ---------------------------------------------------------------------------------------------------------- verbosity
+
+
+@pytest.mark.slow
+def test_quiet_prints_where_the_result_is_and_verbose_what_is_read(command, tmp_path):
+    code, out, err = command("-q", *TINY, "output=job", "resume=true")
+    result = tmp_path / "job" / "result.json"
+    assert (code, err) == (0, "") and out.strip() == str(result)
+    before = result.read_bytes()
+    code, out, err = command("-v", *TINY, "output=job", "resume=true")
+    assert code == 0 and result.read_bytes() == before, "verbosity is none of the settings"
+    code, out, err = command("--quiet", "--multirun", *TINY, "output=sweep", "seed=0,1")
+    assert (code, err) == (0, "") and len(out.split()) == 2 and all(Path(p).is_file() for p in out.split())
+    code, out, err = command("view", "job", f"html={tmp_path / 'view.html'}", "-q")
+    assert (code, out, err) == (0, "", "") and (tmp_path / "view.html").is_file()
+    code, out, err = command("-q", *TINY, "pairs.gap=99")
+    assert code == 2 and out == "" and "pairs.gap" in err
+    code, brief, _ = command(*TINY, "output=a")
+    assert code == 0 and len(brief.splitlines()) <= 15 and "samples by gate" not in brief
+    code, out, err = command(*TINY, "-v", "output=b")
+    lines = err.strip().splitlines()
+    assert code == 0 and "coverage" in out and len(out.splitlines()) > len(brief.splitlines())
+    assert all(re.match(r" *\d+ ms  dhtorch\.", line) for line in lines), err
+    assert any("synthetic_room" in line for line in lines) and any("digest" in line for line in lines)
+    assert not logging.getLogger("dhtorch").handlers and console._VERBOSITY_VARIABLE not in os.environ
+    assert command(*TINY, "output=c")[2] == "", "the next call is as before"
+
+
+class Terminal(io.StringIO):
+    """A stream that reports to be a terminal."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stream", "level", "lines"),
+    [
+        (Terminal, "normal", None),
+        (Terminal, "quiet", []),
+        (io.StringIO, "quiet", []),
+        (io.StringIO, "normal", ["room: 2 of 5, 5.0 s each, 0:15 left", "room: 4 of 5, 5.0 s each, 0:05 left"]),
+    ],
+)
+def test_progress_is_a_bar_on_a_terminal_and_a_line_now_and_then_elsewhere(monkeypatch, stream, level, lines):
+    """Number done, rate and time left, not after the last item; none with quiet output."""
+    now = iter(np.arange(0, 100, 5.0).tolist())
+    if stream is not Terminal:
+        monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr(console, "_LINE_INTERVAL_S", 10.0)
+    monkeypatch.setattr(sys, "stderr", shown := stream())
+    monkeypatch.setenv(console._VERBOSITY_VARIABLE, level)
+    monkeypatch.setenv("TERM", "xterm")
+    assert list(console.progress(range(5), "room", 5)) == list(range(5))
+    assert ("room" in shown.getvalue()) if lines is None else shown.getvalue().splitlines() == lines
+
+
+@pytest.mark.parametrize(
+    ("total", "step_s", "line"), [(3600, 0.5, "2.0/s, 30:00 left"), (2, 7200.0, "7200.0 s each, 2:00:00 left")]
+)
+def test_the_time_left_is_in_minutes_or_hours(monkeypatch, total, step_s, line):
+    now = iter(step_s * np.arange(5))
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr(console, "_LINE_INTERVAL_S", 0.0)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    monkeypatch.delenv(console._VERBOSITY_VARIABLE, raising=False)
+    next(bar := iter(console.progress(range(total), "room", total)))
+    next(bar)
+    assert sys.stderr.getvalue() == f"room: 1 of {total}, {line}\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="a terminal is made by a POSIX call")
+def test_no_color(tmp_path, frames):
+    """On a terminal of its own: a warning in yellow, and without colour where NO_COLOR states that."""
+    import pty  # noqa: PLC0415  (POSIX alone)
+
+    (tmp_path / "images").mkdir()
+    for kind in ("images", "depth"):
+        (tmp_path / "images" / f"{kind}.png").write_bytes((frames / "one" / kind / "00000.png").read_bytes())
+    code = (
+        "import os, sys; from dhtorch.cli.run import main; argv = ['inspect', 'images', '--out', 'sheets']; main(argv);"
+        "print('=' * 9); os.environ['NO_COLOR'] = '1'; main(argv)"
+    )
+    mine, theirs = pty.openpty()
+    env = {k: v for k, v in os.environ.items() if k != "NO_COLOR"} | {"TERM": "xterm", "COLUMNS": "100"}
+    child = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=env, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    printed = b""
+    with os.fdopen(mine, "rb", buffering=0) as stream:
+        try:
+            while part := stream.read(4096):
+                printed += part
+        except OSError:  # the other end is closed
+            pass
+    assert child.wait(60) == 0, printed
+    coloured, plain = printed.decode().split("=" * 9)
+    colour = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|9[0-7]|38;)")
+    assert colour.search(coloured) and "warning" in plain and not colour.search(plain)
+
+
+EVIL = "a\x1b[31mred\x07\x9b2J\u202ereversed\r"
+
+
+def test_nothing_that_a_terminal_obeys_is_printed(tmp_path, capsys):
+    with console.escape_output(), console.escape_output():
+        print(EVIL)
+        print(EVIL, file=sys.stderr)
+        sys.stdout.writelines(["1\t2\n"])
+        assert sys.stdout.encoding and sys.stdout.fileno is not None
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == err.strip() == r"a\x1b[31mred\x07\x9b2J\u202ereversed\x0d" and out.endswith("1\t2\n")
+    texts = {"naïve ✓ 深度": "naïve ✓ 深度", "\U000e0001": r"\U000e0001"}
+    assert {text: console.escape_control(text) for text in texts} == texts
+    folder = tmp_path / EVIL.replace("\r", "")
+    folder.mkdir()
+    for words in (["inspect", str(folder)], ["report", str(folder)], [f"data.x={EVIL}"]):
+        assert run.main(words) == 2
+        out, err = capsys.readouterr()
+        assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", out + err), words
+
+
+# ----------------------------------------------------------------------------------------------- signals and full disks
+
+
+@pytest.mark.parametrize(
+    ("number", "before", "code"),
+    [
+        (signal.SIGTERM, signal.SIG_DFL, 143),
+        (signal.SIGHUP, signal.SIG_DFL, 129),
+        (signal.SIGINT, signal.default_int_handler, 130),
+        (signal.SIGHUP, signal.SIG_IGN, 0),  # as nohup does
+    ],
+)
+def test_a_signal_ends_a_call_in_order(number, before, code, monkeypatch, capsys):
+    tidied = []
+
+    def dispatch(_argv):
+        try:
+            signal.raise_signal(number)
+        finally:
+            tidied.append(True)
+        return 0
+
+    inherited = signal.signal(number, before)
+    monkeypatch.setattr(run, "_dispatch", dispatch)
+    try:
+        assert run.main([]) == code and tidied
+        assert ("dhtorch: interrupted" in capsys.readouterr().err) == (code > 0)
+        assert signal.getsignal(number) is before
+    finally:
+        signal.signal(number, inherited)
+
+
+_PARENT = """
+import multiprocessing, sys, time
+from dhtorch.runtime.parent_watch import exit_with_parent
+def work():
+    exit_with_parent()
+    exit_with_parent()
+    print(multiprocessing.current_process().pid, flush=True)
+    time.sleep(60)
+if __name__ == "__main__":
+    process = multiprocessing.get_context("spawn" if len(sys.argv) > 1 else "fork").Process(target=work)
+    process.start()
+    process.join()
+"""
+
+
+def test_a_worker_ends_with_a_killed_parent(tmp_path):
+    (tmp_path / "parent.py").write_text(_PARENT)
+    parent = subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    with parent.stdout:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+        parent.wait()
+        end = time.monotonic() + 5
+        while Path(f"/proc/{worker}").exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        assert not Path(f"/proc/{worker}").exists()
+
+
+def test_a_full_disk_and_a_limit_of_size_name_the_file(tmp_path, monkeypatch):
+    def full(_handle):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match=r"No space left on device: '.*x\.json'"):
+        patch.setattr(os, "fsync", full)
+        storage.write_json(tmp_path / "x.json", {})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match=r"File too large: '.*x\.json'"):
+            storage.write_json(tmp_path / "x.json", list(range(1000)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert not list(tmp_path.iterdir())
+
+
+def stopping(function, after):
+    """The function, and Ctrl-C where it is called once more than ``after`` times."""
+    calls = iter(range(after))
+
+    def call(*args, **options):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return function(*args, **options)
+
+    return call
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_contact_sheets_and_the_old_page(command, frames, monkeypatch, ran):
+    monkeypatch.setattr(capture, "write_contact_sheet", stopping(capture.write_contact_sheet, 1))
+    code, out, err = command("inspect", str(frames), "--out", "sheets")
+    assert code == 130 and "1 contact sheet in sheets kept" in err and len(err.strip().splitlines()) == 1
+    assert [p.name for p in Path("sheets").glob("*.png")] == [re.search(r"sheets/(\S+png)", out)[1]]
+    Path("job").symlink_to(ran[0] / "job")
+    with open_output_file("out.html", "html"):
+        storage.replace_file("out.html", b"the old one")
+    for words, module, name in (
+        (["report", "job", "--html", "out.html"], page, "render_report"),
+        (["view", "job", "html=out.html"], html, "build_viewer_page"),
+    ):
+        monkeypatch.setattr(module, name, stopping(getattr(module, name), 0))
+        code, _, err = command(*words)
+        assert code == 130 and "interrupted" in err and "Traceback" not in err
+        assert Path("out.html").read_text(encoding="utf-8") == "the old one"
+        assert len(list(Path().glob("*out*"))) == 2, "the page and its manifest"
+
+
+# ------------------------------------------------------------------------------------------------- the way of a capture
+
+
+@pytest.mark.slow
+def test_the_demo_goes_the_whole_way(command, monkeypatch, tmp_path):
+    small = lambda **options: SyntheticRoom(**{**options, "hw": (96, 128), "n_frames": 4})  # noqa: E731
+    monkeypatch.setattr(rooms, "SyntheticRoom", small)
+    words = ["demo", "--max-frames", "1", "--size", "64", "--method.n", "256", "--no-browser", "--out", "d"]
+    code, out, err = command(*words)
+    assert code == 0 and not err
+    result = tmp_path / "d" / "result"
+    assert out.splitlines()[-1] == f"Open {(result / 'view.html').as_uri()}" and (result / "view.html").is_file()
+    glb = (result / "map.glb").read_bytes()
+    chunk = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    position = chunk["accessors"][chunk["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    heights = read_ply_vertices(result / "map.ply").vertex["y"]
+    for low, high in ((heights.min(), heights.max()), (position["min"][1], position["max"][1])):
+        assert -0.2 < low < 0.2 and 1.5 < high < 2.8, "the floor at height 0, the ceiling above it"
+    assert command(*words)[0] == 0, "the capture is used again"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("path", "write", "words", "reader"),
+    [
+        ("it's küche 寝室", writers.write_tum, ["--max-frames", "2"], []),
+        ("above", writers.write_counted_frames, ["--max-frames", "1", "--fov", "60"], ["data.fov=60"]),
+    ],
+)
+def test_the_printed_next_command_runs_with_the_reader_options_of_this_one(
+    command, tmp_path, path, write, words, reader
+):
+    """The way of a phone scan: the map is written and the printed command measures the error."""
+    place = tmp_path / path / ("capture" if reader else "")
+    write(place, list(small_room(4, hw=(120, 160), depth_hw=(120, 160), step_m=0.05, lidar="phone")))
+    (place / "K.txt").unlink(missing_ok=True)
+    code, out, err = command(path, *words, "--size", "96", "--method.n", "512")
+    assert code == 0, err
+    header = next((tmp_path / "dhtorch_out").rglob("map.ply")).read_bytes().partition(b"end_header")[0]
+    assert header.isascii() and b"vertex" in header
+    (line,) = [line for line in out.splitlines() if line.startswith("Next: ")]
+    following = shlex.split(line.partition("dhtorch ")[2])
+    assert following[:2] == ["run", f"{path}/capture" if reader else path] and {*reader} <= {*following}
+    code, out, err = command(*following, "figures=false")
+    assert code == 0 and re.search(r"coverage|answered", out), err
+
+
+@pytest.mark.parametrize("depth", [0.9531, 1.0, 104.2, 9.96, 0.0123, None])
+def test_the_printed_cutoff_lies_among_the_returns(monkeypatch, depth):
+    source = np.full((4, 4), int(Source.NONE if depth is None else Source.SENSOR))
+    maps = {"depth": np.full((4, 4), depth or 1.0)}, source
+    monkeypatch.setattr(process_capture.completed, "read_completed_maps", lambda *_: maps)
+    settings = {"data": {"fov": 60, "K": None, "camera": ["a"]}, "path": "x", "reader_format": "tum"}
+    task = SimpleNamespace(settings=settings, scene=SimpleNamespace(name="x"), frames=[0])
+    line = process_capture._format_next_step(process_capture.RecoveredFrames(task, [0], {}, 0), "a.html")
+    words, _, cutoff = line.rpartition(" --cutoff ")
+    assert words.endswith("dhtorch run x data.fov=60 'data.camera=[a]' data.format=tum")
+    assert float(cutoff) == 2.0 if depth is None else depth <= float(cutoff) < 1.11 * depth
+
+
+# -------------------------------------------------------------------------------------------------------------- sweeps
+
+
+@pytest.mark.slow
+def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):
+    code, out, _ = command("-m", *ROOM[:-1], "figures=false", "pairs.gap=1,2", "method.n=256", "output=a=b")
+    assert code == 0
+    with (tmp_path / "a=b/sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["pairs.gap"] for r in rows] == ["1", "2"]
+    columns = [name for name in rows[0] if name != "note"]  # of jobs without values
+    assert columns == ["pairs.gap", *(metric.name for metric in DEPTH_METRICS)]
+    (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
+    assert len(out.splitlines()) - at < 12
+    assert not (tmp_path / "a=b" / together._NOTES_FOLDER).exists()
+    code, out, _ = command("report", "a=b")
+    assert code == 0 and "pairs.gap" in out and "truth dropped" not in out
+    assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
+    results = [result_files.read_result(p) for p in sorted(tmp_path.rglob("result.json"))]
+    for k, (coverage, error) in enumerate(((0.5, 0.1), (0.4, 0.05))):
+        results[k]["summary"] |= {"coverage": {"value": coverage}, "median_rel": {"value": error}}
+    assert {(0, 1), (1, 2)} <= jobs.jobs_table(results).best
+
+
+@pytest.mark.parametrize(
+    ("shares", "word"),
+    [
+        ({"answer": 0.0, "no_track": 0.9, "residual": 0.1}, "smaller pairs.gap"),
+        ({"answer": 0.0, "no_baseline": 0.9, "residual": 0.1}, "larger pairs.gap"),
+        ({"answer": 0.3, "no_track": 0.7}, None),
+    ],
+)
+def test_few_answers_come_with_advice(shares, word):
+    lines = advice({"rows": [{"scene": "s", "pair": None, "method": "m", "gate_share": shares}]})
+    assert lines == [] if word is None else word in lines[0]
+
+
+def watch(monkeypatch):
+    """Descriptions and finished jobs of the bar over all jobs, as it is drawn."""
+    seen = []
+    bar = SimpleNamespace(add_task=lambda *_, **__: 0, update=lambda _, **shown: seen.append(shown))
+    entered = type("Bar", (), {"__enter__": lambda _: bar, "__exit__": lambda *_: None})
+    monkeypatch.setattr("rich.progress.Progress", lambda *_, **__: entered())
+    monkeypatch.setattr(together, "_PAUSE_S", 0.02)
+    return seen
+
+
+def test_jobs_note_how_far_they_are(tmp_path, monkeypatch):
+    seen, ticks = watch(monkeypatch), iter([False, True])
+    draw = partial(together._draw_bar, tmp_path / together._NOTES_FOLDER, 2)
+    (tmp_path / together._NOTES_FOLDER).mkdir(parents=True)
+    wrap = together.record_progress(tmp_path, "one", 2)
+    assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
+    draw(SimpleNamespace(wait=lambda _: next(ticks)))
+    assert seen == [{"completed": 0.5, "description": "0 of 2 jobs, first"}]
+    together.mark_finished(tmp_path, "one")
+    ticks = iter([False, True])
+    draw(SimpleNamespace(wait=lambda _: next(ticks)))
+    assert seen[1:] == [{"completed": 1.0, "description": "1 of 2 jobs"}]
+    assert list(together.record_progress(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
+
+
+@pytest.mark.slow
+def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, monkeypatch):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    seen = watch(monkeypatch)
+    monkeypatch.setattr(together, "sys", SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True)))
+    few = ["data=synthetic_seeds", "data.seed=[0,1]", "data.hw=[60,80]", "data.n_frames=3"]
+    options = ["method.n=256", "pairs.gap=1,2", "figures=false", "launch=joblib", "hydra.launcher.n_jobs=2"]
+    code, _, err = command("-m", *few, *options, "output=sweep")
+    assert code == 0, err
+    done = [each["completed"] for each in seen]
+    assert done == sorted(done) and any(0 < x < 2 for x in done), "the notes of two workers are one growing sum"
+    assert "of 2 jobs" in seen[-1]["description"] and not (tmp_path / "sweep" / together._NOTES_FOLDER).exists()
