@@ -114,7 +114,8 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     upright = torch.asin((subset @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
     # A surface leans by 5°; twice the score of surfaces with random normals is enough.
-    score = sum(torch.exp(-0.5 * (angle / 0.087) ** 2) for angle in (upright, level)).mean(0)
+    near_upright, near_level = (torch.exp(-0.5 * (angle / 0.087) ** 2) for angle in (upright, level))
+    score = (near_upright + near_level).mean(0)
     best = int(score.argmax())
     return axes[best] if float(score[best]) >= 0.25 else None
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from dhtorch import AUTO, validate_depth
-from dhtorch.cli.validate import _format_wrong_causes
 from dhtorch.codes import State, WrongCause
 from dhtorch.experiments.compare.validate_study import _cause_ratios
 from dhtorch.geometry import plane_sweep
@@ -113,12 +112,6 @@ def test_a_ghost_is_named_by_points_below_the_minimum_range(room, true):
 def test_a_card_needs_a_pose(room):
     with pytest.raises(ValueError, match="has no pose"):
         add_near_card(room[ANCHOR].replace(T_world_from_cam=None), room[ANCHOR].T_world_from_cam, seed=0)
-
-
-def test_the_summary_names_causes_by_their_fraction():
-    share = {"ghost": 0.0, "flying_pixel": 0.004, "edge_bleed": 0.012}
-    assert _format_wrong_causes(share) == " (1.2% edge bleed, 0.4% flying pixel)"
-    assert _format_wrong_causes(dict.fromkeys(share, None)) == ""
 
 
 def test_ratios_of_causes_are_of_the_detected_pixels():
