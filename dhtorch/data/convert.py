@@ -54,10 +54,17 @@ def to_camera(
         raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
     if not ((c > -wh) & (c < 2 * wh)).all():
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
-    coefficients = None if distortion is None else _parse_distortion(distortion, file)
-    return Camera(
-        _to_float32(f)[None], _to_float32(c)[None], None if coefficients is None else _to_float32(coefficients)[None]
-    )
+    lens = None
+    if distortion is not None:
+        count = len(distortion) if isinstance(distortion, (Sequence, np.ndarray)) else -1
+        if count not in (4, 5, 8):
+            raise FormatError(file, "distortion", distortion, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
+        coefficients = to_array(distortion, (count,), file, "distortion")
+        if np.abs(coefficients).max() > _MAX_DISTORTION_COEFFICIENT:
+            expected = f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}"
+            raise FormatError(file, "distortion", coefficients.tolist(), expected)
+        lens = _to_float32(coefficients)[None] if coefficients.any() else None
+    return Camera(_to_float32(f)[None], _to_float32(c)[None], lens)
 
 
 def parse_K_option(values: Sequence[float], root: Path, field: str) -> np.ndarray:
@@ -328,18 +335,6 @@ def size_of_registered_depth(depth_camera: Camera, camera: Camera, hw: tuple[int
     """
     scale = min(1.0, float((depth_camera.f / camera.f).min()))
     return max(1, round(hw[0] * scale)), max(1, round(hw[1] * scale))
-
-
-def _parse_distortion(value: object, file: Path) -> np.ndarray | None:
-    count = len(value) if isinstance(value, (Sequence, np.ndarray)) else -1
-    if count not in (4, 5, 8):
-        raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
-    coefficients = to_array(value, (count,), file, "distortion")
-    if np.abs(coefficients).max() > _MAX_DISTORTION_COEFFICIENT:
-        raise FormatError(
-            file, "distortion", coefficients.tolist(), f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}"
-        )
-    return coefficients if coefficients.any() else None
 
 
 def _to_float32(x: np.ndarray) -> Tensor:

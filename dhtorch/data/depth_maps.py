@@ -176,7 +176,12 @@ def _open_folder(root: Path, recording: Recording, unit: str | float | None) -> 
         clip = _open_clip(map_files[0])
         if len(clip) > 1:
             matched: list[Path | None] = [map_files[0]] * len(numbers)
-            indices = _match_clip(map_files[0], len(clip), numbers)
+            n_maps = len(clip)
+            if n_maps != len(numbers) and max(numbers) >= n_maps:
+                expected = f"one for each of {_describe_frames(numbers)}"
+                raise FormatError(map_files[0], "depth", f"a file that holds {n_maps} maps", expected)
+            # The place among as many frames, else the number.
+            indices = [*range(n_maps)] if n_maps == len(numbers) else [*numbers]
             return DepthMaps(matched, depth_unit, hw, "clip", indices, left_out=left_out)
     matched, matched_by, remarks = _match_files(depth_folder, map_files, numbers)
     return DepthMaps(matched, depth_unit, hw, matched_by, warnings=remarks, left_out=left_out)
@@ -190,15 +195,6 @@ def _find_unit(unit: str | float | None, metadata_file: Path, suffix: str) -> De
         stated = files.to_positive(files.read_json(metadata_file).get("unit_m"), metadata_file, "unit_m")
         return DepthUnit(stated, "complete.json: unit_m")
     return DepthUnit(UNIT_METRES["mm" if suffix == ".png" else "m"])
-
-
-def _match_clip(file: Path, n_maps: int, frames: Sequence[int]) -> list[int]:
-    """Index of every frame's map in a file of ``n_maps``: its place among as many frames, else its number."""
-    if n_maps == len(frames):
-        return [*range(n_maps)]
-    if max(frames) < n_maps:
-        return [*frames]
-    raise FormatError(file, "depth", f"a file that holds {n_maps} maps", f"one for each of {_describe_frames(frames)}")
 
 
 def _match_files(
@@ -218,7 +214,12 @@ def _match_files(
         description += f" numbered {_format_range(file_numbers)}"
     if file_numbers & frame_numbers and None not in numbers_of:
         if frame_numbers <= file_numbers or file_numbers <= frame_numbers:
-            by_number = _index_by_number(map_files, [n for n in numbers_of if n is not None])
+            by_number: dict[int | None, Path] = {}
+            for file, n in zip(map_files, numbers_of, strict=True):
+                first_file = by_number.setdefault(n, file)
+                if first_file is not file:
+                    problem = f"number {n} as {first_file.name} has"
+                    raise FormatError(file, "name", problem, "a number of its own in every name")
             remarks = []
             if min(file_numbers) == min(frame_numbers) + 1:
                 first = min(file_numbers)
@@ -244,15 +245,6 @@ def _numbers_in_name(file: Path) -> list[int]:
     return [int(digits) for digits in re.findall(r"\d+", file.stem)]
 
 
-def _index_by_number(map_files: Sequence[Path], numbers: Sequence[int]) -> dict[int, Path]:
-    by_number: dict[int, Path] = {}
-    for file, n in zip(map_files, numbers, strict=True):
-        first = by_number.setdefault(n, file)
-        if first is not file:
-            raise FormatError(file, "name", f"number {n} as {first.name} has", "a number of its own in every name")
-    return by_number
-
-
 def _format_range(numbers: set[int]) -> str:
     return f"{min(numbers)} to {max(numbers)}"
 
@@ -267,11 +259,6 @@ def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> Non
     if abs(ratio / expected - 1) > _MAX_ASPECT_DIFFERENCE:
         text = f"{file.parent}: maps of {size} are stretched over the whole image, {picture}"
         warnings.warn(text, UserWarning, stacklevel=3)
-
-
-def _read_npy(file: Path) -> np.ndarray:
-    """NPY file → numbers; object arrays are refused, since unpickling can run code."""
-    return read_real_npy(file, "depth")
 
 
 def _read_npz_depth(file: Path) -> np.ndarray:
@@ -306,14 +293,13 @@ def _read_clip(file: Path, _version: tuple[int, ...]) -> np.ndarray:
     return array[None] if is_one else array
 
 
-def _read_png_map(file: Path) -> np.ndarray:
-    return files.read_depth_png(file, 1.0)
-
-
-_ARRAY_READERS: dict[str, Callable[[Path], np.ndarray]] = {".npy": _read_npy, ".npz": _read_npz_depth}
+_ARRAY_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".npy": lambda file: read_real_npy(file, "depth"),  # no object arrays, since unpickling can run code
+    ".npz": _read_npz_depth,
+}
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".png": _read_png_map,
+    ".png": lambda file: files.read_depth_png(file, 1.0),
     ".npy": _read_map,
     ".npz": _read_map,
     ".tif": read_tiff,

@@ -31,15 +31,9 @@ def resample_laser_depth(
         The depth is 0 everywhere if the disagreement exceeds the limit or no pixel is common (then it is NaN).
     """
     at_sensor = resample_depth(laser, laser_camera, sensor_camera, (sensor.shape[0], sensor.shape[1]))
-    disagreement = _median_relative_difference(at_sensor, sensor)
+    common = (at_sensor > 0) & (sensor > 0)
+    difference = ((sensor - at_sensor).abs() / at_sensor)[common]
+    disagreement = float(difference.median()) if bool(common.any()) else math.nan
     if not disagreement <= max_disagreement:
         return torch.zeros(hw, dtype=laser.dtype), disagreement
     return resample_depth(laser, laser_camera, camera, hw), disagreement
-
-
-def _median_relative_difference(truth: Tensor, sensor: Tensor) -> float:
-    """Median of |sensor − truth| / truth over the pixels with both depths; NaN where there is none."""
-    common = (truth > 0) & (sensor > 0)
-    if not bool(common.any()):
-        return math.nan
-    return float(((sensor - truth).abs() / truth)[common].median())

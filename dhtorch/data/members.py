@@ -11,7 +11,6 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io.decode import FormatError, read_bytes
@@ -87,12 +86,15 @@ class ZipMember(Member):
 
     def _stored(self, *spans: tuple[int, int]) -> list[bytes]:
         """Stored bytes of spans (start, count), relative to the entry's data, which follows its local header."""
+        parts: list[bytes] = []
         try:
             with open_regular(self.archive) as stream:
                 stream.seek(self.offset)
                 signature, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER_BYTES))
                 begin = self.offset + _LOCAL_HEADER_BYTES + name + extra
-                parts = [_read_at(stream, begin + start, count) for start, count in spans]
+                for start, count in spans:
+                    stream.seek(begin + start)
+                    parts.append(stream.read(count))
         except (OSError, ValueError, struct.error) as error:
             raise FormatError(self.path, "entry", error, "a zip entry") from None
         short = [(len(data), count) for data, (_, count) in zip(parts, spans, strict=True) if len(data) != count]
@@ -102,12 +104,6 @@ class ZipMember(Member):
                 self.path, "entry", f"{n_read} bytes behind {signature!r}", f"{n_expected} bytes of a zip entry"
             )
         return parts
-
-
-def _read_at(stream: BinaryIO, start: int, count: int) -> bytes:
-    """Up to ``count`` bytes from ``start``."""
-    stream.seek(start)
-    return stream.read(count)
 
 
 def list_folder_members(root: Path) -> dict[str, Member]:
@@ -134,11 +130,11 @@ def list_zip_members(archive: Path) -> dict[str, Member]:
         raise FormatError(archive, "archive", error, "a whole zip archive") from None
     if len(entries) > _MAX_MEMBERS:
         raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {_MAX_MEMBERS}")
-    return {entry.filename: _make_zip_member(archive, entry) for entry in entries if not entry.is_dir()}
-
-
-def _make_zip_member(archive: Path, entry: zipfile.ZipInfo) -> ZipMember:
-    method = -1 if entry.flag_bits & 0x1 else entry.compress_type  # bit 0: encrypted
-    packed = entry.file_size if method == zipfile.ZIP_STORED else entry.compress_size
-    path = Path(f"{archive}/{entry.filename}")  # an absolute name must not hide the archive's
-    return ZipMember(path, archive, entry.header_offset, packed, entry.file_size, method, entry.CRC)
+    members: dict[str, Member] = {}
+    for entry in (each for each in entries if not each.is_dir()):
+        method = -1 if entry.flag_bits & 0x1 else entry.compress_type  # bit 0: encrypted
+        packed = entry.file_size if method == zipfile.ZIP_STORED else entry.compress_size
+        path = Path(f"{archive}/{entry.filename}")  # an absolute name must not hide the archive's
+        sizes = packed, entry.file_size
+        members[entry.filename] = ZipMember(path, archive, entry.header_offset, *sizes, method, entry.CRC)
+    return members

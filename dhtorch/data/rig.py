@@ -86,6 +86,10 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
         if len(r) > n
     ]
     make = TruthRig if truth else Rig
+    R, t = (
+        _gather_by_camera([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, flat)
+        for k in "Rt"
+    )
     return make(
         name=name or recordings[0].name.rpartition("/")[0] or recordings[0].name,
         format=recordings[0].format,
@@ -93,7 +97,7 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
         number=(first[:, None] * C + torch.arange(C)).flatten(),
         root=recordings[0].root,
         times=_gather_by_camera([r.times for r in recordings], camera, flat),
-        poses=_gather_poses(recordings, camera, flat),
+        poses=None if R is None or t is None else Pose(R, t),
         rate_hz=recordings[0].rate_hz,
         sparse=all(r.sparse for r in recordings),
         episode=recordings[0].episode,
@@ -200,11 +204,3 @@ def _gather_by_camera(values: Sequence[Tensor | None], camera: Tensor, places: T
     if len(available) < len(values):
         return None
     return torch.stack([available[c][p] for c, p in zip(camera.tolist(), places.tolist(), strict=True)])
-
-
-def _gather_poses(recordings: Sequence[Recording], camera: Tensor, places: Tensor) -> Pose | None:
-    R, t = (
-        _gather_by_camera([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, places)
-        for k in "Rt"
-    )
-    return None if R is None or t is None else Pose(R, t)

@@ -81,7 +81,9 @@ def survey_recording(
             out.warn(f"frame {int(recording.number[i])} cannot be read: {error}")
     if shots:
         _report_pictures(list(shots.values()), out)
-        _report_depth_maps(list(shots.values()), recording.sparse, out)
+        remark = ", not registered to the picture" * (next(iter(shots.values())).depth_camera is not None)
+        remark += ", sparse returns" * recording.sparse
+        report_depths([s.depth[0] for s in shots.values()], out, remark, recording.sparse)
         _report_confidence([s.conf for s in shots.values() if s.conf is not None], out)
         _report_cameras(list(shots.values()), out)
     _report_poses(recording, out)
@@ -153,11 +155,6 @@ def warn_of_duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None
     """Add a warning where several images are all equal."""
     if len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:]):
         out.warn(f"all {what} that were read are the same picture")
-
-
-def _report_depth_maps(shots: Sequence[Frame], sparse: bool, out: Survey) -> None:
-    remark = ", not registered to the picture" if shots[0].depth_camera is not None else ""
-    report_depths([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
 
 
 def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:

@@ -29,6 +29,17 @@ def truth(room):
     return np.stack([room.truth(k)["depth"][0].numpy() for k in range(N)])
 
 
+def store(folder, maps, name="{k}.npy"):
+    """A file for every map, of the format of its name."""
+    for k, array in enumerate(maps):
+        path = folder / name.format(k=k)
+        path.write_bytes(encode_png(array)) if name.endswith("png") else np.save(path, array)
+
+
+def millimetres(depth):
+    return (1000 * depth).round().astype(np.uint16)
+
+
 def read_all(maps):
     return np.stack([maps[i][0].numpy() for i in range(N)])
 
@@ -47,17 +58,23 @@ def test_one_file_of_a_clip_holds_a_map_for_every_frame(tmp_path, room, truth, s
 
 
 def test_a_clip_of_another_length_is_refused_with_its_number_of_maps(tmp_path, room, truth):
-    np.savez(tmp_path / "clip.npz", depths=truth[:3])
-    with pytest.raises(FormatError, match="a file that holds 3 maps, expected one for each of 4 frames"):
-        open_depth_maps(tmp_path, room)
+    for clip, message in (
+        (truth[:3], "a file that holds 3 maps, expected one for each of 4 frames"),
+        *(
+            (truth[:n, :h, :w], r"clip\.npz: depth: found shape .*, expected \(height, width\)")
+            for n, h, w in ((N, 0, 96), (0, 72, 96), (N, 72, 0))
+        ),
+    ):
+        np.savez(tmp_path / "clip.npz", depths=clip)
+        with pytest.raises(FormatError, match=message):
+            open_depth_maps(tmp_path, room)
     np.savez(tmp_path / "clip.npz", depths=np.concatenate([truth, truth[:2]]))
     assert np.array_equal(read_all(open_depth_maps(tmp_path, room)), truth), "all frames are numbered below six"
 
 
 def test_masks_are_left_out_and_the_number_that_differs_counts(tmp_path, room, truth):
-    for k in range(N):
-        np.save(tmp_path / f"{k:05d}_indoors_000_depth.npy", truth[k][..., None])
-        np.save(tmp_path / f"{k:05d}_indoors_000_depth_mask.npy", np.ones_like(truth[k]))
+    store(tmp_path, truth[..., None], "{k:05d}_indoors_000_depth.npy")
+    store(tmp_path, np.ones_like(truth), "{k:05d}_indoors_000_depth_mask.npy")
     maps = open_depth_maps(tmp_path, room)
     assert np.array_equal(read_all(maps), truth) and maps.by == "number"
     assert any("4 masks left out" in note for note in maps.notes)
@@ -70,21 +87,15 @@ def test_an_archive_with_other_numbers_beside_the_depth(tmp_path, room, truth):
 
 
 def test_depth_packed_in_colours_is_refused(tmp_path, room, truth):
-    for k in range(N):
-        (tmp_path / f"{k}.png").write_bytes(encode_png(np.zeros((72, 96, 3), np.uint8)))
+    store(tmp_path, np.zeros((N, 72, 96, 3), np.uint8), "{k}.png")
     with pytest.raises(FormatError, match="png with 3 channels of 8 bits"):
         open_depth_maps(tmp_path, room)[0]
 
 
 @pytest.mark.parametrize("suffix", ["png", "npy"])
 def test_saturated_values_and_far_planes_are_no_depth(tmp_path, room, truth, suffix):
-    for k in range(N):
-        code = (1000 * truth[k]).round().astype(np.uint16)
-        code[:18] = 65535
-        if suffix == "png":
-            (tmp_path / f"{k}.png").write_bytes(encode_png(code))
-        else:
-            np.save(tmp_path / f"{k}.npy", code / np.float32(1000))
+    codes = np.where(np.arange(72)[:, None] < 18, np.uint16(65535), millimetres(truth))
+    store(tmp_path, codes if suffix == "png" else codes / np.float32(1000), f"{{k}}.{suffix}")
     depth = read_all(open_depth_maps(tmp_path, room))
     assert not depth[:, :18].any() and np.allclose(depth[:, 18:], truth[:, 18:], atol=1e-3)
     np.save(tmp_path / "clip.npy", np.where(np.arange(72)[:, None] < 18, 1000.0, truth))
@@ -96,8 +107,8 @@ def test_saturated_values_and_far_planes_are_no_depth(tmp_path, room, truth, suf
 
 
 def test_maps_numbered_from_one_are_warned_of_with_their_numbers(tmp_path, room, truth):
-    for k in range(N - 1):
-        np.save(tmp_path / f"{k + 1:05d}.npy", truth[k])
+    store(tmp_path, truth[[0, 0, 1, 2]], "{k:05d}.npy")
+    (tmp_path / "00000.npy").unlink()
     maps = open_depth_maps(tmp_path, room)
     assert maps[0] is None and np.array_equal(maps[1][0].numpy(), truth[0])
     (warning,) = maps.warnings
@@ -108,8 +119,7 @@ def test_maps_numbered_from_one_are_warned_of_with_their_numbers(tmp_path, room,
 
 
 def test_the_unit_is_stated_or_named_as_an_assumption(tmp_path, room, truth):
-    for k in range(N):
-        (tmp_path / f"{k}.png").write_bytes(encode_png((1000 * truth[k]).round().astype(np.uint16)))
+    store(tmp_path, millimetres(truth), "{k}.png")
     assumed = open_depth_maps(tmp_path, room)
     assert assumed.unit.is_assumed and assumed.notes == ["maps: depth unit assumed: 1/1000 m"]
     assert assumed.report["depth_unit"] == "depth unit assumed: 1/1000 m" and not assumed.doubts
@@ -132,13 +142,9 @@ def test_the_unit_is_stated_or_named_as_an_assumption(tmp_path, room, truth):
     ],
 )
 def test_values_that_are_no_depth_in_the_unit_are_doubted(tmp_path, room, truth, change, words):
+    changed = change(truth.astype(np.float64))
     is_png = "10000" in words
-    for k in range(N):
-        x = change(truth[k].astype(np.float64))
-        if is_png:
-            (tmp_path / f"{k}.png").write_bytes(encode_png((1000 * x).round().astype(np.uint16)))
-        else:
-            np.save(tmp_path / f"{k}.npy", x.astype(np.float32))
+    store(tmp_path, millimetres(changed) if is_png else changed.astype(np.float32), "{k}.png" if is_png else "{k}.npy")
     (doubt,) = open_depth_maps(tmp_path, room).doubts
     assert doubt.startswith("warning: maps: ") and words in doubt and "data." not in doubt
 
@@ -197,8 +203,7 @@ def test_the_unit_of_a_folder_above_is_not_taken(tmp_path, room, truth):
     (tmp_path / "complete.json").write_text('{"unit_m": 0.5}')
     for name in ("maps", "depth"):
         (tmp_path / name).mkdir()
-        for k in range(N):
-            np.save(tmp_path / name / f"{k}.npy", truth[k])
+        store(tmp_path / name, truth)
     assert np.array_equal(read_all(open_depth_maps(tmp_path / "maps", room)), truth)
     with pytest.raises(
         FormatError, match=f"a part of a folder of dhtorch complete, expected {tmp_path}, or depth_unit"
@@ -207,20 +212,12 @@ def test_the_unit_of_a_folder_above_is_not_taken(tmp_path, room, truth):
     assert np.allclose(read_all(open_depth_maps(tmp_path / "depth", room, "m")), truth)
 
 
-@pytest.mark.parametrize("shape", [(N, 0, 96), (0, 72, 96), (N, 72, 0)])
-def test_a_clip_without_pixels_is_refused(tmp_path, room, shape):
-    np.save(tmp_path / "clip.npy", np.zeros(shape, np.float32))
-    with pytest.raises(FormatError, match=r"clip\.npy: depth: found shape .*, expected \(height, width\)"):
-        open_depth_maps(tmp_path, room)
-
-
 @pytest.mark.parametrize("linked", ["2.npy", "depth", "complete.json", "clip.npy", "gone.npy"])
 def test_links_that_leave_the_folder_are_refused(tmp_path, room, truth, linked):
     outside, root = tmp_path / "outside", tmp_path / "maps"
     for folder in (outside, root / "depth"):
         folder.mkdir(parents=True)
-        for k in range(N):
-            np.save(folder / f"{k}.npy", truth[k])
+        store(folder, truth)
     (outside / "complete.json").write_text('{"unit_m": 0.5}')
     np.save(outside / "clip.npy", truth)
     link, target = root / "depth" / linked, outside / linked

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,67 +116,69 @@ def test_sizes_of_splats_grow_with_the_scale(tmp_path):
     np.testing.assert_allclose(vertex["opacity"][:3], 2.0)
 
 
-@pytest.mark.parametrize(
-    ("kind", "file", "damage"),
-    [
-        ("colmap bin", "images.bin", lambda data: data[: len(data) // 2]),
-        ("colmap bin", "points3D.bin", lambda data: b"\xff" * 8 + data[8:]),
-        ("colmap bin", "cameras.bin", lambda data: data[:12] + b"\x05" + data[13:]),
-        ("colmap txt", "images.txt", lambda data: data.replace(b".png", b"", 1).replace(b" 000000", b"", 1)),
-        ("nerfstudio", "sparse_pc.ply", lambda data: data[: len(data) // 2]),
-        ("nerfstudio", "transforms.json", lambda data: data.replace(b"sparse_pc.ply", b"../../etc/x.ply")),
-        ("splat", "cameras.json", lambda data: data.replace(b'"fx"', b'"fq"')),
-        ("npz", "predictions.npz", lambda data: data[: len(data) // 2]),
-        ("npz", "predictions.npz", lambda data: data.replace(b"intrinsic", b"xntrinsic")),
-    ],
-)
-def test_a_damaged_model_is_one_line(tmp_path, kind, file, damage):
-    _, folder = write(tmp_path, kind)
-    (folder / file).write_bytes(damage((folder / file).read_bytes()))
-    with pytest.raises(FormatError) as error:
-        read_model(folder)
-    assert "\n" not in str(error.value) and ": found " in str(error.value)
-
-
-def with_arrays(folder, **changes):
+def change_arrays(file, **changes):
     """The archive of a network's maps with other arrays."""
-    with np.load(folder / "predictions.npz") as stored:
+    with np.load(file) as stored:
         arrays = {name: stored[name] for name in stored.files}
-    np.savez(
-        folder / "predictions.npz", **{k: v(arrays[k]) if callable(v) else v for k, v in (arrays | changes).items()}
-    )
+    np.savez(file, **arrays | {name: change(arrays[name]) for name, change in changes.items()})
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"extrinsic": lambda x: 0 * x},
-        {"extrinsic": lambda x: x.reshape(-1)},
-        {"extrinsic": lambda x: x[:0]},
-        {"extrinsic": lambda x: np.nan * x},
-        {"extrinsic": np.zeros((0, 5000), np.uint8)},
-        {"intrinsic": lambda x: 0 * x},
-        {"intrinsic": np.float32(3)},
-        {"intrinsic": lambda x: -x},
-        {"depth": np.float32(3)},
-        {"depth": lambda x: x[:, :0]},
-        {"names": np.array([])},
-        {"names": np.array(["a"] * 3)},
-    ],
-    ids=lambda changes: next(iter(changes)),
-)
-def test_arrays_of_other_shapes_and_numbers_are_one_line(tmp_path, changes):
-    _, folder = write(tmp_path, "npz")
-    with_arrays(folder, **{k: v if callable(v) else (lambda _, v=v: v) for k, v in changes.items()})
-    with pytest.raises(FormatError) as error:
+def with_mask(file, name="mask.png"):
+    text = file.read_text().replace('{"file_path"', f'{{"mask_path": "{name}", "file_path"', 1)
+    file.write_text(text)
+    return file.parent / name
+
+
+#: Kind of a model, one of its files, what is done to its bytes or to the file, and words of the error.
+DAMAGED = [
+    *(
+        (kind, file, lambda path, damage=damage: path.write_bytes(damage(path.read_bytes())), "")
+        for kind, file, damage in [
+            ("colmap bin", "images.bin", lambda data: data[: len(data) // 2]),
+            ("colmap bin", "points3D.bin", lambda data: b"\xff" * 8 + data[8:]),
+            ("colmap bin", "cameras.bin", lambda data: data[:12] + b"\x05" + data[13:]),
+            ("colmap txt", "images.txt", lambda data: data.replace(b".png", b"", 1).replace(b" 000000", b"", 1)),
+            ("nerfstudio", "sparse_pc.ply", lambda data: data[: len(data) // 2]),
+            ("nerfstudio", "transforms.json", lambda data: data.replace(b"sparse_pc.ply", b"../../etc/x.ply")),
+            ("splat", "cameras.json", lambda data: data.replace(b'"fx"', b'"fq"')),
+            ("npz", "predictions.npz", lambda data: data[: len(data) // 2]),
+            ("npz", "predictions.npz", lambda data: data.replace(b"intrinsic", b"xntrinsic")),
+        ]
+    ),
+    *(
+        ("npz", "predictions.npz", lambda path, name=name, change=change: change_arrays(path, **{name: change}), "")
+        for name, change in [
+            ("extrinsic", lambda x: 0 * x),
+            ("extrinsic", lambda x: x.reshape(-1)),
+            ("extrinsic", lambda x: x[:0]),
+            ("extrinsic", lambda x: np.nan * x),
+            ("extrinsic", lambda x: np.zeros((0, 5000), np.uint8)),
+            ("intrinsic", lambda x: 0 * x),
+            ("intrinsic", lambda x: np.float32(3)),
+            ("intrinsic", lambda x: -x),
+            ("depth", lambda x: np.float32(3)),
+            ("depth", lambda x: x[:, :0]),
+            ("names", lambda x: np.array([])),
+            ("names", lambda x: np.array(["a"] * 3)),
+        ]
+    ),
+    *(
+        ("splat", "point_cloud.ply", lambda path, make=make: (path.unlink(), make(path)), f"point_cloud.ply: file: found {what}, expected a regular file")
+        for make, what in ((Path.mkdir, "a folder"), (os.mkfifo, "a pipe"))
+    ),
+    ("nerfstudio", "transforms.json", lambda path: STRANGE_FILES["3 GiB"](with_mask(path)), r"mask\.png: file size: found 3221225472 bytes, expected at most"),
+    ("nerfstudio", "transforms.json", lambda path: [path.rename(path.with_name("other"))], "COLMAP"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "name", "damage", "words"), DAMAGED)
+def test_a_damaged_model_is_one_line(tmp_path, kind, name, damage, words):
+    _, folder = write(tmp_path, kind)
+    (file,) = folder.rglob(name)
+    damage(file)
+    with pytest.raises(FormatError, match=words) as error:
         read_model(folder)
     assert "\n" not in str(error.value) and ": found " in str(error.value) and str(folder) in str(error.value)
-
-
-def test_points_have_three_coordinates(tmp_path):
-    values = {"c2w": np.eye(4)[None], "K": np.eye(3)[None], "points": np.ones((1, 5, 6, 2))}
-    with pytest.raises(FormatError, match=r"depth or points: found shape \(1, 5, 6, 2\)"):
-        list(network._views_of_arrays(tmp_path / "a.npz", values, None))
 
 
 def test_points_that_are_no_places_are_left_out(tmp_path):
@@ -188,16 +191,6 @@ def test_points_that_are_no_places_are_left_out(tmp_path):
     vertex["x"][:2], vertex["z"][3] = np.nan, np.inf
     file.write_bytes(vertices.encode(vertex))
     assert len(read_model(folder).xyz) == len(model.xyz) - 3
-
-
-@pytest.mark.parametrize("kind", ["a folder", "a pipe"])
-def test_points_that_are_no_file_are_named(tmp_path, kind):
-    _, folder = write(tmp_path, "splat")
-    (file,) = folder.rglob("point_cloud.ply")
-    file.unlink()
-    file.mkdir() if kind == "a folder" else os.mkfifo(file)
-    with pytest.raises(FormatError, match=f"point_cloud.ply: file: found {kind}, expected a regular file"):
-        read_model(folder)
 
 
 LINKED = [
@@ -214,11 +207,7 @@ def write_with_link(tmp_path, kind, name, elsewhere):
     made.write_pictures(folder / "images")
     if name.startswith("masks"):
         (folder / "masks").mkdir()
-        (folder / name).write_bytes(b"not to be copied")
-        text = (folder / "transforms.json").read_text()
-        (folder / "transforms.json").write_text(
-            text.replace('{"file_path"', f'{{"mask_path": "{name}", "file_path"', 1)
-        )
+        with_mask(folder / "transforms.json", name).write_bytes(b"not to be copied")
     (folder / name).rename(elsewhere)
     (folder / name).symlink_to(elsewhere)
     return folder
@@ -236,20 +225,6 @@ def test_a_link_within_a_model_is_followed(tmp_path, kind, name):
     folder = write_with_link(tmp_path, kind, name, tmp_path / "model" / "elsewhere")
     write_model(read_model(folder), tmp_path / "out", Similarity(2.0, np.eye(3), np.zeros(3)))
     assert not name.startswith("masks") or (tmp_path / "out" / name).read_bytes() == b"not to be copied"
-
-
-def test_a_mask_of_3_gib_is_not_copied(tmp_path):
-    _, folder = write(tmp_path, "nerfstudio")
-    text = (folder / "transforms.json").read_text()
-    (folder / "transforms.json").write_text(text.replace('{"file_path"', '{"mask_path": "mask.png", "file_path"', 1))
-    STRANGE_FILES["3 GiB"](folder / "mask.png")
-    with pytest.raises(FormatError, match=r"mask\.png: file size: found 3221225472 bytes, expected at most"):
-        read_model(folder)
-
-
-def test_no_model_names_the_formats(tmp_path):
-    with pytest.raises(FormatError, match="COLMAP"):
-        read_model(tmp_path)
 
 
 # ------------------------------------------------------------------------------------------------- points and maps
@@ -317,45 +292,45 @@ def arrays_of(n=3, hw=(4, 5), **changes):
     return {"depth": depth, "c2w": c2w, "K": K} | changes, np.where(depth > 0, depth, 0)
 
 
-@pytest.mark.parametrize("poses", ["c2w", "w2c", "w2c of three rows"])
-@pytest.mark.parametrize("maps", ["depth", "depth of one channel", "points"])
-def test_maps_of_a_network_are_read_for_every_view(tmp_path, poses, maps):
+def with_w2c(values, rows=4):
+    return {"w2c": np.linalg.inv(values["c2w"])[:, :rows], "K": values["K"], "depth": values["depth"]}
+
+
+def with_points(values):
+    v, u = np.mgrid[:4, :5]
+    f = np.stack((values["K"][:, 0, 0], values["K"][:, 1, 1]), -1)[:, None, None]
+    stored, c2w = values["depth"][..., None], values["c2w"]
+    local = np.concatenate((np.stack((u, v), -1) / f * stored, stored), -1)
+    points = np.einsum("nij,nhwj->nhwi", c2w[:, :3, :3], local) + c2w[:, None, None, :3, 3]
+    return {"c2w": c2w, "K": values["K"], "points": points}
+
+
+RAMP = np.arange(20.0).reshape(4, 5)
+NAMES = ["x/one.png", "two", "three"]
+#: What a network stores of the arrays, the names of its views, and what is read: views, K and the mask of the maps.
+STORED = {
+    "c2w": (lambda a: a, NAMES, slice(None), lambda K: K, RAMP >= 0),
+    "w2c": (with_w2c, NAMES, slice(None), lambda K: K, RAMP >= 0),
+    "w2c of three rows": (lambda a: with_w2c(a, 3), NAMES, slice(None), lambda K: K, RAMP >= 0),
+    "one channel": (lambda a: a | {"depth": a["depth"][..., None]}, NAMES, slice(None), lambda K: K, RAMP >= 0),
+    "points": (with_points, NAMES, slice(None), lambda K: K, RAMP >= 0),
+    "points and w2c": (lambda a: with_points(a) | with_w2c(a) | {"depth": a["depth"]}, NAMES, slice(None), lambda K: K, RAMP >= 0),
+    # The least confident quarter is left out, and one camera serves all views.
+    "confidence": (lambda a: a | {"conf": np.tile(RAMP, (3, 1, 1)), "K": a["K"][1]}, None, slice(None), lambda K: K[[1, 1, 1]], RAMP >= 5),
+    "one view": (lambda a: {name: each[2] for name, each in a.items()}, None, slice(2, 3), lambda K: K[2:], RAMP >= 0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", STORED)
+def test_maps_of_a_network_are_read_for_every_view(tmp_path, kind):
+    store, names, chosen, K_of, kept = STORED[kind]
     values, depth = arrays_of()
-    c2w = values["c2w"]
-    if poses != "c2w":
-        w2c = np.linalg.inv(values.pop("c2w"))
-        values["w2c"] = w2c[:, :3] if "three" in poses else w2c
-    if maps == "points":
-        v, u = np.mgrid[:4, :5]
-        f = np.stack((values["K"][:, 0, 0], values["K"][:, 1, 1]), -1)[:, None, None]
-        stored = values.pop("depth")[..., None]
-        local = np.concatenate((np.stack((u, v), -1) / f * stored, stored), -1)
-        values["points"] = np.einsum("nij,nhwj->nhwi", c2w[:, :3, :3], local) + c2w[:, None, None, :3, 3]
-    elif "channel" in maps:
-        values["depth"] = values["depth"][..., None]
-    views = list(network._views_of_arrays(tmp_path / "a.npz", values, ["x/one.png", "two", "three"]))
-    assert [view.name for view in views] == ["one.png", "two", "three"] and all(v.hw == (4, 5) for v in views)
-    for k, view in enumerate(views):
-        np.testing.assert_allclose(view.depth, depth[k], atol=1e-12)
-        np.testing.assert_allclose(view.c2w, c2w[k], atol=1e-12)
-        np.testing.assert_allclose(view.K, values["K"][k])
-
-
-def test_the_least_confident_quarter_is_left_out_and_one_camera_serves_all_views(tmp_path):
-    values, depth = arrays_of(conf=np.tile(np.arange(20.0).reshape(4, 5), (3, 1, 1)))
-    values["K"] = values["K"][1]
-    views = list(network._views_of_arrays(tmp_path / "a.npz", values, None))
-    assert [view.name for view in views] == ["000000", "000001", "000002"]
-    for k, view in enumerate(views):
-        np.testing.assert_array_equal(view.depth, np.where(np.arange(20).reshape(4, 5) < 5, 0, depth[k]))
-        np.testing.assert_array_equal(view.K, values["K"])
-
-
-def test_arrays_without_an_axis_of_views_are_one_view(tmp_path):
-    values, depth = arrays_of()
-    (view,) = network._views_of_arrays(tmp_path / "a.npz", {name: each[2] for name, each in values.items()}, None)
-    np.testing.assert_array_equal(view.depth, depth[2])
-    np.testing.assert_array_equal(view.c2w, values["c2w"][2])
+    views = list(network._views_of_arrays(tmp_path / "a.npz", store(values), names))
+    expected = ["one.png", "two", "three"] if names else [f"{k:06d}" for k in range(len(depth[chosen]))]
+    assert [view.name for view in views] == expected and all(view.hw == (4, 5) for view in views)
+    np.testing.assert_allclose([view.depth for view in views], np.where(kept, depth[chosen], 0), atol=1e-12)
+    np.testing.assert_allclose([view.c2w for view in views], values["c2w"][chosen], atol=1e-12)
+    np.testing.assert_allclose([view.K for view in views], K_of(values["K"]))
 
 
 @pytest.mark.parametrize(
@@ -366,6 +341,7 @@ def test_arrays_without_an_axis_of_views_are_one_view(tmp_path):
         ({"conf": np.ones((2, 4, 5))}, "shapes: found .* expected the same number of views in all arrays, here 3"),
         ({"depth": np.ones((3, 4, 5, 2))}, "shapes: found "),
         ({"c2w": None, "w2c": np.zeros((3, 4, 4))}, "poses: found a singular matrix"),
+        ({"depth": None, "points": np.ones((3, 5, 6, 2))}, r"depth or points: found shape \(3, 5, 6, 2\)"),
     ],
 )
 def test_arrays_of_another_shape_are_named(tmp_path, changes, words):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -59,12 +60,6 @@ def test_edges_correlate_whatever_their_mean_and_scale_are() -> None:
     assert orientation.edge_correlation(a, 2 * a + 3, torch.ones(6, 8, dtype=torch.bool)) == pytest.approx(1, abs=1e-5)
 
 
-@pytest.mark.parametrize("k", range(8))
-def test_a_symmetry_is_undone_by_its_inverse(k: int) -> None:
-    x = torch.arange(12.0).view(1, 3, 4)
-    assert torch.equal(orientation.apply_symmetry(orientation.apply_symmetry(x, k), orientation._inverse(k)), x)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("k", range(8))
 def test_the_symmetry_that_undoes_a_planted_one_is_selected(k: int) -> None:
@@ -72,15 +67,15 @@ def test_the_symmetry_that_undoes_a_planted_one_is_selected(k: int) -> None:
     planted = [(room[i].image[0], orientation.apply_symmetry(room[i].depth[0], k)) for i in range(3)]
     inverse = k if k >= 4 else -k % 4
     selected, scores = orientation.select_symmetry(planted)
-    assert selected == inverse
-    assert scores.shape == (8,)
-    assert float(scores.abs().max()) <= 1
+    assert selected == inverse and scores.shape == (8,) and float(scores.abs().max()) <= 1
 
 
 def test_symmetries_are_the_eight_of_a_rectangle() -> None:
     x = torch.arange(6.0).reshape(2, 3)
     images = {tuple(orientation.apply_symmetry(x, k).flatten().tolist()) for k in range(8)}
     assert len(images) == 8
+    for k in range(8):
+        assert torch.equal(orientation.apply_symmetry(orientation.apply_symmetry(x, k), orientation._inverse(k)), x)
     assert torch.equal(orientation.apply_symmetry(x, 6), x.flip(-2))
     assert torch.equal(orientation.apply_symmetry(x, 1)[0], torch.tensor([3.0, 0.0]))  # clockwise: left column on top
 
@@ -121,50 +116,53 @@ def write_folder(
     (root / "K.txt").write_text(f"{fx} 0 {cx}\n0 {fy} {cy}\n0 0 1\n")
 
 
-def same(recording: data.Recording, room: SyntheticRoom, k: int, grey: float = 0.0) -> None:
-    """Picture, depth and K are those of the room under one symmetry."""
+def same(recording: data.Recording, room: SyntheticRoom, k: int, grey: float = 0.0, k_of_camera: int = 0) -> None:
+    """Picture and depth are those of the room under one symmetry, K under one."""
     for got, true in zip(recording, room, strict=True):
         picture = orientation.apply_symmetry(true.image[0], k)
         assert got.image.shape[1:] == picture.shape
         assert float((got.image[0].float() - picture.float()).abs().mean()) <= grey
         depth = orientation.apply_symmetry(true.depth[0], k)
         torch.testing.assert_close(got.depth[0], depth, atol=6e-4, rtol=0)
-        torch.testing.assert_close(got.camera.c, convert.rot90_camera(true.camera, HW, k).c, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            got.camera.c, convert.rot90_camera(true.camera, HW, k_of_camera).c, atol=1e-4, rtol=0
+        )
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg"])
-@pytest.mark.parametrize(("exif", "upright"), [(6, 1), (8, 3)])
-def test_stored_pictures_are_turned_as_exif_states_where_depth_is_upright(
-    tmp_path: Path, room: SyntheticRoom, exif: int, upright: int, kind: str
+#: How the folder is written, options, and under which symmetry of the room it is read, with a line of its report; or the
+#: error.
+FOLDERS = [
+    *(
+        ({"depth": k, "K": k, "exif": exif, "kind": kind}, {}, k, f"EXIF orientation {exif}: pictures are turned")
+        for exif, k in ((6, 1), (8, 3))
+        for kind in ("png", "jpg")
+    ),
+    *(({"exif": exif}, {}, 0, f"EXIF orientation {exif}: pictures are read as stored") for exif in (3, 6, 8)),
+    *(({"depth": k, "exif": exif}, {}, k, "") for exif, k in ((2, 4), (3, 2), (4, 6))),  # edges decide, not sizes
+    *(({"depth": k}, {}, 0, "orientation: depth 96x128 (portrait) beside pictures 128x96") for k in (1, 3, 5, 7)),
+    *(({"picture": k}, {}, 0, "pictures are turned") for k in (1, 3)),  # K is that of depth
+    *(
+        ({"depth": k}, {"depth_turn": turn}, 0, "")
+        for turn, k in (("90", 1), (180, 2), ("270", 3), ("left_right", 4), ("upside_down", 6))
+    ),
+    ({"depth": 3, "K": 3, "exif": 6}, {}, None, r"orientation: found EXIF orientation 6, but edges .*depth_turn"),
+]
+
+
+@pytest.mark.parametrize(("written", "options", "k", "words"), FOLDERS)
+def test_pictures_and_depth_are_read_in_one_orientation(
+    tmp_path: Path, room: SyntheticRoom, written: dict[str, Any], options: dict[str, Any], k: int | None, words: str
 ) -> None:
-    write_folder(tmp_path, room, depth=upright, K=upright, exif=exif, kind=kind)
-    recording = data.open(tmp_path)
-    same(recording, room, upright, 6.0 if kind == "jpg" else 0.0)
-    assert any(f"EXIF orientation {exif}: pictures are turned" in line for line in recording.report)
+    write_folder(tmp_path, room, **written)
+    if k is None:
+        with pytest.raises(FormatError, match=words):
+            data.open(tmp_path)
+        return
+    recording = data.open(tmp_path, **options)
+    # A mirrored K is not written: the principal point stays where it was.
+    same(recording, room, k, 6.0 if written.get("kind") == "jpg" else 0.0, k_of_camera=written.get("K", 0))
+    assert any(words in line for line in recording.report) or not words
     assert recording.stored is None
-
-
-@pytest.mark.parametrize("exif", [3, 6, 8])
-def test_stored_pictures_stay_where_depth_is_stored_like_them(tmp_path: Path, room: SyntheticRoom, exif: int) -> None:
-    write_folder(tmp_path, room, exif=exif)
-    recording = data.open(tmp_path)
-    same(recording, room, 0)
-    assert any(f"EXIF orientation {exif}: pictures are read as stored" in line for line in recording.report)
-
-
-@pytest.mark.parametrize(("exif", "upright"), [(2, 4), (3, 2), (4, 6)])
-def test_edges_decide_where_sizes_do_not(tmp_path: Path, room: SyntheticRoom, exif: int, upright: int) -> None:
-    write_folder(tmp_path, room, depth=upright, exif=exif)
-    recording = data.open(tmp_path)
-    for got, true in zip(recording, room, strict=True):
-        assert torch.equal(got.image[0], orientation.apply_symmetry(true.image[0], upright))
-        torch.testing.assert_close(got.depth[0], orientation.apply_symmetry(true.depth[0], upright), atol=6e-4, rtol=0)
-
-
-def test_a_tag_that_depth_contradicts_is_refused(tmp_path: Path, room: SyntheticRoom) -> None:
-    write_folder(tmp_path, room, depth=3, K=3, exif=6)
-    with pytest.raises(FormatError, match=r"orientation: found EXIF orientation 6, but edges .*depth_turn"):
-        data.open(tmp_path)
 
 
 def test_pictures_of_other_tags_than_the_first_are_refused(tmp_path: Path, room: SyntheticRoom) -> None:
@@ -181,24 +179,6 @@ def _tag(value: int) -> Image.Exif:
     return tags
 
 
-@pytest.mark.parametrize("k", [1, 3, 5, 7])
-def test_portrait_depth_is_turned_back_where_K_is_that_of_the_picture(
-    tmp_path: Path, room: SyntheticRoom, k: int
-) -> None:
-    write_folder(tmp_path, room, depth=k)
-    recording = data.open(tmp_path)
-    same(recording, room, 0)
-    assert any("orientation: depth 96x128 (portrait) beside pictures 128x96" in line for line in recording.report)
-
-
-@pytest.mark.parametrize("k", [1, 3])
-def test_pictures_are_turned_back_where_K_is_that_of_depth(tmp_path: Path, room: SyntheticRoom, k: int) -> None:
-    write_folder(tmp_path, room, picture=k)
-    recording = data.open(tmp_path)
-    same(recording, room, 0)
-    assert any("pictures are turned" in line for line in recording.report)
-
-
 def test_portrait_depth_without_edges_is_refused_unless_an_option_decides(tmp_path: Path, room: SyntheticRoom) -> None:
     write_folder(tmp_path, room, depth=1)
     for file in (tmp_path / "depth").iterdir():
@@ -206,12 +186,6 @@ def test_portrait_depth_without_edges_is_refused_unless_an_option_decides(tmp_pa
     with pytest.raises(FormatError, match=r"orientation: found depth 96x128 \(portrait\) .*depth_turn=90 or 270"):
         data.open(tmp_path)
     assert data.open(tmp_path, depth_turn=90)[0].depth.shape[1:] == HW
-
-
-@pytest.mark.parametrize(("turn", "k"), [("90", 1), (180, 2), ("270", 3), ("left_right", 4), ("upside_down", 6)])
-def test_option_depth_turn_undoes_a_turn(tmp_path: Path, room: SyntheticRoom, turn: object, k: int) -> None:
-    write_folder(tmp_path, room, depth=k)
-    same(data.open(tmp_path, depth_turn=turn), room, 0)
 
 
 def test_an_option_turns_the_depth_of_a_recording_whose_sizes_are_not_stated(room: SyntheticRoom) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import pickle
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -113,19 +113,13 @@ def test_chunks_of_mcap_are_decompressed(tmp_path: Path, compression: str) -> No
     same_frames(data.open(tmp_path / "a.mcap"), frames)
 
 
-def test_grey_pictures(tmp_path: Path) -> None:
-    frames = walk(2)
-    write_rosbag(tmp_path / "bag", frames, BagLayout(colour_encoding="mono8"))
-    assert torch.equal(data.open(tmp_path / "bag")[1].image[0, 0], frames[1].image[0, 1])
-
-
-def test_holes_are_zero(tmp_path: Path) -> None:
+def test_grey_images_and_holes(tmp_path: Path) -> None:
     (frame,) = walk(1)
-    depth = frame.depth.clone()
-    depth[0, 0, :4] = torch.tensor([float("nan"), float("inf"), -1.0, 0.0])
-    write_rosbag(tmp_path / "bag", [frame.replace(depth=depth)], BagLayout(depth_encoding="32FC1"))
-    got = data.open(tmp_path / "bag")[0].depth
-    assert got[0, 0, :4].tolist() == [0, 0, 0, 0] and bool((got[0, 1:] > 0).all())
+    frame.depth[0, 0, :4] = torch.tensor([float("nan"), float("inf"), -1.0, 0.0])
+    write_rosbag(tmp_path / "bag", [frame], BagLayout(colour_encoding="mono8", depth_encoding="32FC1"))
+    got = data.open(tmp_path / "bag")[0]
+    assert torch.equal(got.image[0, 0], frame.image[0, 1])
+    assert got.depth[0, 0, :4].tolist() == [0, 0, 0, 0] and bool((got.depth[0, 1:] > 0).all())
 
 
 def test_a_raw_topic_is_preferred_and_topics_can_be_set(tmp_path: Path) -> None:
@@ -134,19 +128,17 @@ def test_a_raw_topic_is_preferred_and_topics_can_be_set(tmp_path: Path) -> None:
     write_rosbag(tmp_path / "a.bag", frames, BagLayout(storage="ros1"))
     assert data.open(tmp_path / "a.bag").camera_name == "/camera/color/image_raw"
 
-    def add_compressed(bag: BagWriter) -> None:
-        compressed = {"colour_topic": "/camera/color/image_raw/compressed", "colour_encoding": "png"}
-        for frame in other:
-            bag.write_frame(frame, BagLayout(**compressed, depth_topic="/spare/depth/image", infos=False, poses=False))
-
-    write_rosbag(tmp_path / "b", frames, begin=add_compressed)
+    spare = {"depth_topic": "/spare/depth/image", "infos": False, "poses": False}
+    layout = BagLayout(colour_topic=PACKED, colour_encoding="png", **spare)
+    write_rosbag(tmp_path / "b", frames, begin=lambda bag: [bag.write_frame(frame, layout) for frame in other])
     same_frames(data.open(tmp_path / "b"), frames)
-    chosen = data.open(tmp_path / "b", color="/camera/color/image_raw/compressed")
-    assert torch.equal(chosen[0].image, other[0].image)
-    with pytest.raises(FormatError, match=r"option color: found /nothing, expected one of /camera"):
-        data.open(tmp_path / "b", color="/nothing")
-    with pytest.raises(FormatError, match=r"option depth: found /camera/color/image_raw of encoding rgb8"):
-        data.open(tmp_path / "b", depth="/camera/color/image_raw")
+    assert torch.equal(data.open(tmp_path / "b", color=PACKED)[0].image, other[0].image)
+    for options, message in (
+        ({"color": "/nothing"}, r"option color: found /nothing, expected one of /camera"),
+        ({"depth": "/camera/color/image_raw"}, r"option depth: found /camera/color/image_raw of encoding rgb8"),
+    ):
+        with pytest.raises(FormatError, match=message):
+            data.open(tmp_path / "b", **options)
 
 
 def test_each_camera_is_a_recording(tmp_path: Path) -> None:
@@ -159,11 +151,7 @@ def test_each_camera_is_a_recording(tmp_path: Path) -> None:
         for side in ("left", "right")
     ]  # fmt: skip
 
-    def begin(bag: BagWriter) -> None:
-        for frame in right:
-            bag.write_frame(frame, layouts[1])
-
-    write_rosbag(tmp_path / "bag", left, layouts[0], begin=begin)
+    write_rosbag(tmp_path / "bag", left, layouts[0], begin=lambda bag: [bag.write_frame(f, layouts[1]) for f in right])
     recordings = data.open_all(tmp_path / "bag")
     by_camera = {recording.camera_name: recording for recording in recordings}
     assert by_camera.keys() == {"/left/color/image_raw", "/right/color/image_raw"}
@@ -249,11 +237,8 @@ def test_the_sdk_of_realsense_states_unit_and_extrinsics(tmp_path: Path) -> None
 def test_unpaired_pictures_are_left_out_and_named(tmp_path: Path) -> None:
     frames = walk(5)
 
-    def begin(bag: BagWriter) -> None:
-        for i, frame in enumerate(frames):
-            bag.write_frame(frame, BagLayout(depth_lag_s=0.6 if i == 2 else 0.0))
-
-    write_rosbag(tmp_path / "bag", [], begin=begin)
+    layouts = [BagLayout(depth_lag_s=0.6 if i == 2 else 0.0) for i in range(5)]
+    write_rosbag(tmp_path / "bag", [], begin=lambda bag: [*map(bag.write_frame, frames, layouts)])
     recording = data.open(tmp_path / "bag")
     assert recording.number.tolist() == [0, 1, 3, 4]
     assert any(line.startswith("frame 2: no depth of") for line in recording.report)
@@ -265,13 +250,13 @@ def test_poses_along_a_chain_are_interpolated(tmp_path: Path) -> None:
     mount = se3.exp(torch.tensor([[0.1, 0.2, -0.3, 1.2, -1.2, 1.2]]).double())
     T_body = [matrix(se3.compose(frame.T_world_from_cam, se3.invert(mount))) for frame in frames]
 
-    def begin(bag: BagWriter) -> None:
-        bag.write_transform("/tf_static", 100.0, "base_link", CAMERA_FRAME, matrix(mount))
-        for frame, T in zip(frames, T_body, strict=True):
-            bag.write_transform("/tf", float(frame.time), "odom", "base_link", T)
-
+    stated = [
+        ("/tf_static", 100.0, "base_link", CAMERA_FRAME, matrix(mount)),
+        *(("/tf", float(frame.time), "odom", "base_link", T) for frame, T in zip(frames, T_body, strict=True)),
+    ]
     middle = [frames[0], frames[1].replace(time=(frames[0].time + frames[1].time) / 2)]
-    write_rosbag(tmp_path / "bag", middle, BagLayout(poses=False), begin=begin)
+    layout = BagLayout(poses=False)
+    write_rosbag(tmp_path / "bag", middle, layout, begin=lambda bag: [bag.write_transform(*each) for each in stated])
     recording = data.open(tmp_path / "bag")
     torch.testing.assert_close(recording[0].T_world_from_cam.t, frames[0].T_world_from_cam.t, atol=1e-9, rtol=0)
     between = recording[1].T_world_from_cam
@@ -282,11 +267,9 @@ def test_poses_along_a_chain_are_interpolated(tmp_path: Path) -> None:
 
 
 def test_poses_in_a_frame_that_may_move_are_named(tmp_path: Path) -> None:
-    def begin(bag: BagWriter) -> None:
-        for frame in walk(2):
-            bag.write_transform("/tf", float(frame.time), "base_link", CAMERA_FRAME, matrix(frame.T_world_from_cam))
-
-    write_rosbag(tmp_path / "bag", walk(2), BagLayout(poses=False), begin=begin)
+    stated = [("/tf", float(f.time), "base_link", CAMERA_FRAME, matrix(f.T_world_from_cam)) for f in walk(2)]
+    layout = BagLayout(poses=False)
+    write_rosbag(tmp_path / "bag", walk(2), layout, begin=lambda bag: [bag.write_transform(*each) for each in stated])
     recording = data.open(tmp_path / "bag")
     assert recording.report == ("poses are relative to the frame base_link: valid only while that is stationary",)
     same_frames(recording, walk(2))
@@ -295,12 +278,9 @@ def test_poses_in_a_frame_that_may_move_are_named(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------- intrinsics
 
 
-def test_without_calibration_K_is_asked_for(tmp_path: Path) -> None:
-    frames = walk(2)
-    write_rosbag(tmp_path / "bag", frames, BagLayout(infos=False))
-    with pytest.raises(FormatError, match=r"no intrinsics, expected .*data.K=.* CameraInfo of /camera/color/image_raw"):
-        data.open(tmp_path / "bag")
-    same_frames(data.open(tmp_path / "bag", K=[61.5, 58.25, 33.5, 21.75]), frames)
+def test_without_calibration_K_is_an_option(tmp_path: Path) -> None:
+    write_rosbag(tmp_path / "bag", walk(2), BagLayout(infos=False))
+    same_frames(data.open(tmp_path / "bag", K=[61.5, 58.25, 33.5, 21.75]), walk(2))
 
 
 def info(model: str, d: Sequence[float], focal: Sequence[float] = (600.0, 600.0), **more: int) -> SimpleNamespace:
@@ -384,10 +364,25 @@ def test_bayer_and_yuv_pictures() -> None:
 # ---------------------------------------------------------------------------------------------- damaged, odd, hostile
 
 
-def test_other_topics_are_named(tmp_path: Path) -> None:
-    write_rosbag(tmp_path / "bag", walk(2), BagLayout(depth_topic="/a/ir/image"))
-    with pytest.raises(FormatError, match=r"depth topic: found .*/a/ir/image \(16UC1\)"):
-        data.open(tmp_path / "bag")
+@pytest.mark.parametrize(
+    ("layout", "n", "begin", "message"),
+    [
+        (BagLayout(depth_topic="/a/ir/image"), 2, None, r"depth topic: found .*/a/ir/image \(16UC1\)"),
+        (BagLayout(infos=False), 2, None, r"no intrinsics, expected .*data.K=.* CameraInfo of /camera/color/image_raw"),
+        (
+            BagLayout("ros1"),
+            0,
+            lambda bag: [bag.write("/joy", "std_msgs/msg/Float32", 100.0, {"data": 1.0}) for _ in range(2)],
+            r"colour topic: found /joy \(std_msgs/Float32\), expected",
+        ),
+    ],
+)
+def test_what_a_bag_lacks_is_named(
+    tmp_path: Path, layout: BagLayout, n: int, begin: Callable[[BagWriter], object] | None, message: str
+) -> None:
+    write_rosbag(tmp_path / "a.bag", walk(n or 1)[:n], layout, begin=begin)
+    with pytest.raises(FormatError, match=message):
+        data.open(tmp_path / "a.bag")
 
 
 @pytest.mark.parametrize("name", STORAGES)
@@ -451,13 +446,3 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
         assert bags.decompress_chunk(packed, compression, 1_000_000, tmp_path) == zeros
     with pytest.raises(FormatError, match=named):
         bags.decompress_chunk(packed, compression, size, tmp_path)
-
-
-def test_topics_of_other_types_are_named_by_type(tmp_path: Path) -> None:
-    def begin(bag: BagWriter) -> None:
-        for _ in range(2):
-            bag.write("/joy", "std_msgs/msg/Float32", 100.0, {"data": 1.0})
-
-    write_rosbag(tmp_path / "a.bag", [], BagLayout("ros1"), begin=begin)
-    with pytest.raises(FormatError, match=r"colour topic: found /joy \(std_msgs/Float32\), expected"):
-        data.open(tmp_path / "a.bag")

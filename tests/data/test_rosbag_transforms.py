@@ -52,46 +52,44 @@ def test_poses_are_products_along_the_chain_between_the_stamps() -> None:
         np.testing.assert_allclose(T, matrix((x, 0, 0), turn) @ hand, atol=1e-9)
 
 
-def test_times_far_from_every_stamp_have_no_pose() -> None:
-    late = transform("odom", "base", 3, (3, 0, 0))
-    found = robot(late).poses("camera", np.array([-0.06, -0.04, 1.04, 1.06, 2, 2.96, 3.04, 3.06]) * S, BAG)
-    assert found is not None
-    assert found[1].tolist() == [False, True, True, False, False, True, True, False]
+def arm(*more: Transform) -> TransformTree:
+    return tree(transform("base", "arm", 0, (0, 1, 0)), *more)
+
+
+#: Tree, frame, times in s, and where the frame has a pose; None: it has none at all.
+COVERED = [
+    (robot(transform("odom", "base", 3, (3, 0, 0))), "camera", [-0.06, -0.04, 1.04, 1.06, 2, 2.96, 3.04, 3.06], [0, 1, 1, 0, 0, 1, 1, 0]),
+    (robot(transform("map", "base", 0, (0, 0, 0))), "camera", [0], None),  # a moving frame of two parents
+    (robot(transform("tool", "camera", 0, (0, 0, 0))), "camera", [0], None),  # a fixed frame of two parents
+    (robot(transform("camera", "odom", 0, (0, 0, 0))), "camera", [0], None),  # a circle
+    (robot(), "nobody", [0], None),
+    (arm(transform("base", "arm", 1, (0, 1 + 5e-10, 0))), "arm", [0], None),  # nothing moves
+    (arm(transform("base", "arm", 0.1, (0, 1 + 2e-9, 0))), "arm", [0], [1]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "frame", "times", "covered"), COVERED)
+def test_when_a_frame_has_a_pose(
+    made: TransformTree, frame: str, times: list[float], covered: list[int] | None
+) -> None:
+    answer = made.poses(frame, np.array(times) * S, BAG)
+    assert (None if answer is None else answer[1].astype(int).tolist()) == covered
 
 
 @pytest.mark.parametrize(
-    "more",
+    ("target", "source", "expected"),
     [
-        transform("map", "base", 0, (0, 0, 0)),
-        transform("tool", "camera", 0, (0, 0, 0)),
-        transform("camera", "odom", 0, (0, 0, 0)),
+        ("/camera", "tool", np.linalg.inv(matrix((0, 0, 2))) @ matrix((0.5, 0, 0), 30)),  # over their common ancestor
+        ("base", "/camera", matrix((0, 1, 0), 90) @ matrix((0, 0, 2))),
+        ("arm", "arm", np.eye(4)),
+        ("odom", "camera", None),  # base moves
+        ("elsewhere", "camera", None),
     ],
-    ids=["a moving frame of two parents", "a fixed frame of two parents", "a circle"],
 )
-def test_a_chain_that_is_none_has_no_poses(more: Transform) -> None:
-    assert robot(more).poses("camera", np.array([0]), BAG) is None
-
-
-def test_where_nothing_moves_there_are_no_poses() -> None:
-    fixed = tree(transform("base", "arm", 0, (0, 1, 0)), transform("base", "arm", 1, (0, 1 + 5e-10, 0)))
-    assert fixed.poses("arm", np.array([0]), BAG) is None and robot().poses("nobody", np.array([0]), BAG) is None
-    moved = tree(transform("base", "arm", 0, (0, 1, 0)), transform("base", "arm", 0.1, (0, 1 + 2e-9, 0)))
-    assert moved.poses("arm", np.array([0]), BAG) is not None
-
-
-def test_fixed_transforms_join_two_frames_over_their_common_ancestor() -> None:
-    made = robot(transform("arm", "tool", 0, (0.5, 0, 0), 30))
-    T_camera_from_tool = np.linalg.inv(matrix((0, 0, 2))) @ matrix((0.5, 0, 0), 30)
-    found = made.fixed_transform("/camera", "tool")
-    assert found is not None
-    np.testing.assert_allclose(found, T_camera_from_tool, atol=1e-12)
-    up = made.fixed_transform("base", "/camera")
-    assert up is not None
-    np.testing.assert_allclose(up, matrix((0, 1, 0), 90) @ matrix((0, 0, 2)), atol=1e-12)
-    same = made.fixed_transform("arm", "arm")
-    assert same is not None and np.array_equal(same, np.eye(4))
-    assert made.fixed_transform("odom", "camera") is None, "base moves"
-    assert made.fixed_transform("elsewhere", "camera") is None
+def test_fixed_transforms_join_two_frames(target: str, source: str, expected: np.ndarray | None) -> None:
+    answer = robot(transform("arm", "tool", 0, (0.5, 0, 0), 30)).fixed_transform(target, source)
+    assert (answer is None) == (expected is None)
+    assert answer is None or np.allclose(answer, expected, atol=1e-12)
 
 
 def test_a_tree_that_is_too_large_is_not_whole(monkeypatch: pytest.MonkeyPatch) -> None:

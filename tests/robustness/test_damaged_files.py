@@ -15,15 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-pytest.importorskip("av")
-pytest.importorskip("h5py")
-pytest.importorskip("lzfse")
-pytest.importorskip("OpenEXR")
-pytest.importorskip("pyarrow")
-
 from support import byte_damage as mutations
 from support import damage_harness as hostile
 from support.captures_by_format import SAMPLES as CAPTURES
@@ -123,29 +114,6 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
     counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MANY, seed=1)
     print(f"{name}: {dict(counts)}")
     assert counts.total() == MANY
-
-
-#: Formats of every fourteenth kind with few examples; the others, and many of all, run with the slow tests.
-EXAMPLES = [
-    *(pytest.param(name, 3, marks=[pytest.mark.slow] * (k % 14 > 0)) for k, name in enumerate(SAMPLES)),
-    *(pytest.param(name, 80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)]) for name in SAMPLES),
-]
-
-
-@pytest.mark.parametrize(("name", "examples"), EXAMPLES)
-def test_damage_that_hypothesis_looks_for(name: str, examples: int, tmp_path: Path) -> None:
-    """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
-    write, read = SAMPLES[name]
-    with hostile.sample(write, read, tmp_path) as (good, outcome_of):
-
-        @settings(max_examples=examples, deadline=None, derandomize=True, database=None)
-        @given(draw=st.randoms(use_true_random=False))
-        def check(draw: random.Random) -> None:
-            what, want = mutations.mutate(good, draw)
-            outcome = outcome_of(want)
-            assert outcome.kind in hostile.FINE, f"{what}: {outcome}"
-
-        check()
 
 
 # ------------------------------------------------------------------------------------- the harness finds what it should

@@ -1,7 +1,6 @@
 """Random damage of captures: changed bytes, text, archive members and files, as from a bad disk, download or attacker.
 
-A capture is ``{relative path: bytes}``. Every choice is drawn from the given generator: a seed repeats a mutant, and
-Hypothesis can make the choices instead.
+A capture is ``{relative path: bytes}``. Every choice is drawn from the given generator: a seed repeats a mutant.
 """
 
 from __future__ import annotations
@@ -116,7 +115,7 @@ def _damage(capture: Capture, name: str, draw: random.Random) -> str:
     assert content is not None
     if not content:
         return "empty already"
-    special: list[Callable[[bytes, str, random.Random], bytes]] = []
+    special: list[Callable[[bytes, random.Random], bytes]] = []
     if content[:4] == b"\x89PNG":
         special = [_png]
     elif content[:2] == b"PK":
@@ -126,7 +125,7 @@ def _damage(capture: Capture, name: str, draw: random.Random) -> str:
     elif name.endswith((".json", ".pincam", ".txt", ".csv", ".traj", ".jsonl")) or _is_text(content):
         special = [_json, _json, _word] if content.lstrip()[:1] in (b"{", b"[") else [_word, _lines]
     way = draw.choice(special if special and draw.random() < 0.75 else _BYTES)
-    capture[name] = way(content, name, draw)
+    capture[name] = way(content, draw)
     return way.__name__.strip("_")
 
 
@@ -142,38 +141,38 @@ def _at(content: bytes, draw: random.Random) -> int:
     return draw.randrange(min(128, len(content)) if draw.random() < 0.5 else len(content))
 
 
-def _flip(content: bytes, name: str, draw: random.Random) -> bytes:
+def _flip(content: bytes, draw: random.Random) -> bytes:
     out = bytearray(content)
     for _ in range(draw.choice((1, 1, 2, 8, 64))):
         out[_at(content, draw)] ^= 1 << draw.randrange(8)
     return bytes(out)
 
 
-def _truncate(content: bytes, name: str, draw: random.Random) -> bytes:
+def _truncate(content: bytes, draw: random.Random) -> bytes:
     return content[: _at(content, draw)]
 
 
-def _insert(content: bytes, name: str, draw: random.Random) -> bytes:
+def _insert(content: bytes, draw: random.Random) -> bytes:
     at = _at(content, draw)
     return content[:at] + draw.randbytes(draw.choice((1, 2, 4, 100))) + content[at:]
 
 
-def _delete(content: bytes, name: str, draw: random.Random) -> bytes:
+def _delete(content: bytes, draw: random.Random) -> bytes:
     at = _at(content, draw)
     return content[:at] + content[at + draw.choice((1, 2, 4, 100)) :]
 
 
-def _duplicate(content: bytes, name: str, draw: random.Random) -> bytes:
+def _duplicate(content: bytes, draw: random.Random) -> bytes:
     at, to = sorted((_at(content, draw), _at(content, draw)))
     return content[:to] + content[at:]
 
 
-def _zero(content: bytes, name: str, draw: random.Random) -> bytes:
+def _zero(content: bytes, draw: random.Random) -> bytes:
     at, size = _at(content, draw), draw.choice((1, 4, 64, 4096))
     return content[:at] + bytes([draw.choice((0, 0, 255))]) * len(content[at : at + size]) + content[at + size :]
 
 
-def _integer(content: bytes, name: str, draw: random.Random) -> bytes:
+def _integer(content: bytes, draw: random.Random) -> bytes:
     """An absurd number over an aligned field, in either byte order."""
     size = draw.choice((1, 2, 4, 8))
     at = _at(content, draw) // size * size
@@ -181,7 +180,7 @@ def _integer(content: bytes, name: str, draw: random.Random) -> bytes:
     return content[:at] + value.to_bytes(size, draw.choice(("little", "big"))) + content[at + size :]
 
 
-def _pickled(content: bytes, name: str, draw: random.Random) -> bytes:
+def _pickled(content: bytes, draw: random.Random) -> bytes:
     """A pickle that ends the process when it is loaded, plain or as a numpy array of objects."""
     payload = pickle.dumps(_Bomb(), protocol=2)
     if draw.random() < 0.5:
@@ -208,42 +207,30 @@ _WORDS = [
 ]
 
 
-def _spans(text: str, draw: random.Random) -> tuple[int, int]:
-    """(start, end) of a random word between separators."""
-    at = draw.randrange(len(text)) if text else 0
-    low, high = at, at
-    while low > 0 and text[low - 1] not in " \t\r\n,;=[]{}()\"'":
-        low -= 1
-    while high < len(text) and text[high] not in " \t\r\n,;=[]{}()\"'":
-        high += 1
-    return low, high
-
-
-def _word(content: bytes, name: str, draw: random.Random) -> bytes:
+def _word(content: bytes, draw: random.Random) -> bytes:
     """A word replaced by a hostile one; a file name sometimes by the path of the intact copy."""
     text = content.decode(errors="replace")
-    low, high = _spans(text, draw)
+    at = draw.randrange(len(text)) if text else 0
+    separators = [k for k, letter in enumerate(text) if letter in " \t\r\n,;=[]{}()\"'"]
+    low = max((k + 1 for k in separators if k < at), default=0)
+    high = min((k for k in separators if k >= at), default=len(text))
     word = text[low:high]
     new = f"../intact/{word}" if "." in word and "/" in word and draw.random() < 0.5 else draw.choice(_WORDS)
     return (text[:low] + new + text[high:]).encode()
 
 
-def _lines(content: bytes, name: str, draw: random.Random) -> bytes:
+def _lines(content: bytes, draw: random.Random) -> bytes:
     """A line removed, repeated, moved or cut: missing frames and time stamps out of order."""
     lines = content.split(b"\n")
     i, j = draw.randrange(len(lines)), draw.randrange(len(lines))
-    way = draw.randrange(5)
-    if way == 0:
-        del lines[i]
-    elif way == 1:
-        lines.insert(j, lines[i])
-    elif way == 2:
-        lines[i], lines[j] = lines[j], lines[i]
-    elif way == 3:
-        lines[i] = lines[i][: draw.randrange(len(lines[i]) + 1)]
-    else:
-        lines = lines[:i]
-    return b"\n".join(lines)
+    ways = [
+        [*lines[:i], *lines[i + 1 :]],
+        [*lines[:j], lines[i], *lines[j:]],
+        [lines[{i: j, j: i}.get(k, k)] for k in range(len(lines))],
+        [*lines[:i], lines[i][: draw.randrange(len(lines[i]) + 1)], *lines[i + 1 :]],
+        lines[:i],
+    ]
+    return b"\n".join(draw.choice(ways))
 
 
 _VALUES: tuple[Any, ...] = (
@@ -254,7 +241,7 @@ _VALUES: tuple[Any, ...] = (
 )
 
 
-def _json(content: bytes, name: str, draw: random.Random) -> bytes:
+def _json(content: bytes, draw: random.Random) -> bytes:
     """A value of a JSON document (or of one line of it) replaced, removed, repeated, nested or renamed."""
     try:
         value = json.loads(content)
@@ -264,8 +251,8 @@ def _json(content: bytes, name: str, draw: random.Random) -> bytes:
         try:
             json.loads(lines[i])
         except (ValueError, RecursionError):
-            return _word(content, name, draw)
-        lines[i] = _json(lines[i], name, draw)
+            return _word(content, draw)
+        lines[i] = _json(lines[i], draw)
         return b"\n".join(lines)
     holder: Any = {"": value}
     where: Any = ""
@@ -292,7 +279,7 @@ def _json(content: bytes, name: str, draw: random.Random) -> bytes:
 # containers -------------------------------------------------------------------------------------------------------
 
 
-def _png(content: bytes, name: str, draw: random.Random) -> bytes:
+def _png(content: bytes, draw: random.Random) -> bytes:
     """A chunk damaged and its check sum corrected, so that the decoder reads it."""
     chunks, at = [], 8
     while at + 12 <= len(content):
@@ -305,7 +292,7 @@ def _png(content: bytes, name: str, draw: random.Random) -> bytes:
     if kind == b"IDAT" and way == 0:
         body = zlib.compress(draw.choice((b"", b"\x09" * 100, bytes(1_000_000))))
     elif body and way < 3:
-        body = draw.choice((_flip, _integer, _truncate, _duplicate))(body, name, draw)
+        body = draw.choice((_flip, _integer, _truncate, _duplicate))(body, draw)
     else:
         chunks.insert(
             draw.randrange(len(chunks)), (draw.choice((b"PLTE", b"tRNS", b"zTXt", b"IDAT", b"iCCP")), b"\xff" * 7)
@@ -315,16 +302,16 @@ def _png(content: bytes, name: str, draw: random.Random) -> bytes:
     return content[:8] + b"".join(framed)
 
 
-def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
+def _zip(content: bytes, draw: random.Random) -> bytes:
     """A member of a valid archive damaged, removed, repeated, named outside the archive, or a decompression bomb."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members: Capture = {info.filename: archive.read(info) for info in archive.infolist() if not info.is_dir()}
             method = archive.infolist()[0].compress_type if archive.infolist() else zipfile.ZIP_STORED
     except (zipfile.BadZipFile, ValueError, RuntimeError, zlib.error, OSError):
-        return _flip(content, name, draw)
+        return _flip(content, draw)
     if not members:
-        return _flip(content, name, draw)
+        return _flip(content, draw)
     bomb = _member(members, draw)
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", method) as archive:
@@ -333,15 +320,15 @@ def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
     return with_bomb(out.getvalue(), bomb) if bomb else out.getvalue()
 
 
-def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
+def _tar(content: bytes, draw: random.Random) -> bytes:
     """The same damage in a tar archive; also members that are links and devices."""
     try:
         with tarfile.open(fileobj=io.BytesIO(content)) as archive:
             members: Capture = {m.name: archive.extractfile(m).read() for m in archive.getmembers() if m.isfile()}  # type: ignore[union-attr]
     except (tarfile.TarError, ValueError, EOFError, OSError):
-        return _flip(content, name, draw)
+        return _flip(content, draw)
     if not members:
-        return _flip(content, name, draw)
+        return _flip(content, draw)
     _member(members, draw)
     odd = draw.choice(sorted(members)) if members and draw.random() < 0.2 else None
     out = io.BytesIO()

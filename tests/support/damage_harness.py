@@ -146,7 +146,7 @@ def sample(
 ) -> Iterator[tuple[Capture, Callable[[Capture], Outcome]]]:
     """Writes an intact sample; yields it and a function that replaces it by another capture and reads that.
 
-    Arguments as of :func:`attack`; for tests that draw their mutants otherwise, such as Hypothesis.
+    Arguments as of :func:`attack`; for those that draw their mutants otherwise.
     """
     root = tmp_path / "capture"
     root.mkdir()

@@ -67,8 +67,14 @@ def read_colmap_cameras(file: Path) -> dict[int, ColmapLens]:
     Raises:
         FormatError: a camera model without OpenCV's distortion, or a damaged file.
     """
-    rows = _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file)
-    return {number: _make_lens(model, (round(h), round(w)), values) for number, model, (w, h), values in rows}
+    lenses = {}
+    for number, model, (w, h), values in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
+        n_focal, _ = COLMAP_LENSES[model]
+        focal, (cx, cy), lens = values[:n_focal], values[n_focal : n_focal + 2], values[n_focal + 2 :]
+        padded = [*lens, *[0.0] * (4 - len(lens))] if lens else []
+        K = convert.make_K(focal[0], focal[-1], cx - 0.5, cy - 0.5)  # pixel centres at integers
+        lenses[number] = ColmapLens((round(h), round(w)), K, tuple(padded) if any(padded) else None)
+    return lenses
 
 
 def read_colmap_images(file: Path, *, observations: bool = True) -> list[ColmapImageEntry]:
@@ -110,15 +116,6 @@ def replace_numbers(file: Path, numbers: Sequence[ColmapNumbers]) -> bytes:
         end = lines[at][len(lines[at].rstrip("\r\n")) :]
         lines[at] = " ".join([words[0], *(f"{v:.12g}" for v in values), *words[len(values) + 1 :]]) + end
     return "".join(["# metres\n", *lines]).encode("utf-8")
-
-
-def _make_lens(model: str, hw: tuple[int, int], values: Sequence[float]) -> ColmapLens:
-    """Parameters of a camera model of :data:`COLMAP_LENSES` → camera with pixel centres at integers."""
-    n_focal, _ = COLMAP_LENSES[model]
-    focal, (cx, cy), lens = values[:n_focal], values[n_focal : n_focal + 2], values[n_focal + 2 :]
-    padded = [*lens, *[0.0] * (4 - len(lens))] if lens else []
-    K = convert.make_K(focal[0], focal[-1], cx - 0.5, cy - 0.5)
-    return ColmapLens(hw, K, tuple(padded) if any(padded) else None)
 
 
 # ---------------------------------------------------------------------------------------------------------------- text

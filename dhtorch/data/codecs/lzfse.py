@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from types import ModuleType
 
 from dhtorch.data.io.decode import FormatError, import_optional
 
@@ -27,12 +26,9 @@ def decompress_lzfse(data: bytes, size: int, file: Path, field: str) -> bytes:
     declared = lzfse_unpacked_size(data, file, field)
     if declared != size:
         raise FormatError(file, field, f"{declared} bytes when unpacked", f"{size} bytes")
-    # imagecodecs decodes into a buffer of fixed size; the others grow theirs as far as a hostile stream demands.
-    decoder = import_optional("imagecodecs", "liblzfse", "lzfse")
-    try:
-        is_bounded = decoder.__name__ == "imagecodecs"
-        raw = bytes(decoder.lzfse_decode(data, out=size) if is_bounded else decoder.decompress(data))
-    except _decoder_errors(decoder) as error:
+    try:  # into a buffer of fixed size, which no stream enlarges
+        raw = bytes(import_optional("imagecodecs").lzfse_decode(data, out=size))
+    except (RuntimeError, ValueError, MemoryError) as error:
         raise FormatError(file, field, error or "damaged blocks", "a whole LZFSE stream") from None
     if len(raw) != size:
         raise FormatError(file, field, f"{len(raw)} bytes when unpacked", f"{size} bytes")
@@ -66,8 +62,3 @@ def lzfse_unpacked_size(data: bytes, file: Path, field: str) -> int:
             raise FormatError(file, field, problem, "a whole LZFSE block") from None
         at, size = at + length, size + raw
     return size
-
-
-def _decoder_errors(decoder: ModuleType) -> tuple[type[Exception], ...]:
-    own = (getattr(decoder, name, ValueError) for name in ("error", "LzfseError"))
-    return (RuntimeError, ValueError, MemoryError, *own)

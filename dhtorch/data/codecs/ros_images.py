@@ -71,12 +71,6 @@ def decode_depth(image: Any, metres: float, file: Path) -> np.ndarray:
     return _clean(pixels.astype(np.float32) * np.float32(metres))
 
 
-def is_compressed_depth(encoding: str, topic: str) -> bool:
-    """Whether the format or the topic of a compressed picture is that of depth."""
-    pixels = encoding.partition(";")[0].strip()
-    return "compressedDepth" in encoding or topic.endswith("/compressedDepth") or pixels in ("16UC1", "32FC1")
-
-
 def strip_depth_header(data: bytes, is_depth: bool) -> bytes:
     """PNG of compressed depth, which stands behind a header of twelve bytes; other data is unchanged."""
     at = _DEPTH_HEADER.size

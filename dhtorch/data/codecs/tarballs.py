@@ -76,7 +76,10 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
         name, kind = _decode_text(header[:100]), header[156:157]
         folder = _decode_text(header[345:500]) if header[257:263] == b"ustar\0" else ""
         name = f"{folder}/{name}" if folder else name
-        size = _parse_pax_size(file, special["size"], at) if "size" in special else size
+        if (text := special.get("size")) is not None:
+            if not (text.isascii() and text.isdecimal() and len(text) <= 18):
+                raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
+            size = int(text)
         size = 0 if kind in _KINDS_WITHOUT_DATA else size
         data, at = at + _BLOCK_BYTES, at + _BLOCK_BYTES + (size + _BLOCK_BYTES - 1) // _BLOCK_BYTES * _BLOCK_BYTES
         if data + size > total:
@@ -84,8 +87,8 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
         if kind in _LONG_NAME + _PAX:
             if size > _MAX_NAME_BYTES:
                 raise FormatError(file, f"header at byte {data}", f"{size} bytes", f"at most {_MAX_NAME_BYTES} bytes")
-            text = os.pread(stream, size, data)
-            special |= _parse_pax(text) if kind == _PAX else {"path": _decode_text(text)}
+            content = os.pread(stream, size, data)
+            special |= _parse_pax(content) if kind == _PAX else {"path": _decode_text(content)}
             continue
         if kind in _FILES:
             yield TarMember(special.get("path", name), data, size)
@@ -94,13 +97,6 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
         special = {}
     if at == 0:
         raise FormatError(file, "content", f"{total} bytes", "a tar archive")
-
-
-def _parse_pax_size(file: Path, text: str, at: int) -> int:
-    """The size in a pax header."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= 18):
-        raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
-    return int(text)
 
 
 def _parse_number(field: bytes) -> int | None:

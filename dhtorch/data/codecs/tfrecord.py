@@ -59,7 +59,11 @@ def index_records(file: Path) -> list[ByteSpan]:
             total, at = os.fstat(stream.fileno()).st_size, 0
             while at < total:
                 head = os.pread(stream.fileno(), _HEADER_BYTES, at)
-                length = _parse_length(file, head, at)
+                if len(head) < _HEADER_BYTES:
+                    raise FormatError(file, f"record at byte {at}", f"{len(head)} bytes", "a TFRecord header of 12")
+                length, stored = struct.unpack("<QI", head)
+                if mask_crc(crc32c(head[:8])) != stored:
+                    raise FormatError(file, f"record at byte {at}", "a wrong checksum of its length", "a TFRecord")
                 if at + _HEADER_BYTES + length + _FOOTER_BYTES > total:
                     raise FormatError(file, f"record {len(spans)}", f"{total - at} bytes", f"{length} and 16 more")
                 spans.append(ByteSpan(at + _HEADER_BYTES, length))
@@ -193,15 +197,6 @@ def _crc_shift_table() -> np.ndarray:
     for _ in range(_CRC_BLOCK_BYTES):
         state = _crc_table()[state & 0xFF] ^ (state >> 8)
     return state
-
-
-def _parse_length(file: Path, head: bytes, at: int) -> int:
-    if len(head) < _HEADER_BYTES:
-        raise FormatError(file, f"record at byte {at}", f"{len(head)} bytes", "a TFRecord header of 12")
-    length, stored = struct.unpack("<QI", head)
-    if mask_crc(crc32c(head[:8])) != stored:
-        raise FormatError(file, f"record at byte {at}", "a wrong checksum of its length", "a TFRecord")
-    return length
 
 
 class _Message:

@@ -164,13 +164,8 @@ def read_image_header(file: Path) -> ImageHeader:
     return decode_image_header(read_bytes(file), file)
 
 
-def decode_image_header(data: bytes, file: Path) -> ImageHeader:
-    """As :func:`read_image_header`, of bytes in memory; ``file`` names them in errors."""
-    return _parse_header(file, data)
-
-
 def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
-    header = _parse_header(file, data)
+    header = decode_image_header(data, file)
     if hw is not None and header.hw != tuple(hw):
         turned = ", another orientation" if header.hw == (hw[1], hw[0]) else ""
         raise FormatError(file, "size", f"{_format_size(header.hw)}{turned}", _format_size(hw))
@@ -188,7 +183,8 @@ def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageH
     return header
 
 
-def _parse_header(file: Path, data: bytes) -> ImageHeader:
+def decode_image_header(data: bytes, file: Path) -> ImageHeader:
+    """As :func:`read_image_header`, of bytes in memory; ``file`` names them in errors."""
     if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 33 and data[12:16] == b"IHDR":
         w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
         channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)

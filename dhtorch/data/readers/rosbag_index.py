@@ -140,7 +140,9 @@ def _describe_stream(message: IndexedMessage, head: Any, *, compressed: bool) ->
     stream = ImageStream(topic, compressed, head.header.frame_id, full)
     name = stream.base.lower()
     if compressed:
-        is_depth = ros_images.is_compressed_depth(full, topic.name)
+        is_depth = (
+            "compressedDepth" in full or topic.name.endswith("/compressedDepth") or encoding in ("16UC1", "32FC1")
+        )
     else:
         is_depth = encoding in ros_images.DEPTH_ENCODINGS and (encoding != "mono16" or "depth" in name)
     is_colour = not is_depth and (compressed or encoding in ros_images.COLOUR_CHANNELS)
