@@ -78,7 +78,9 @@ def write_colmap(
     distinct = list(dict.fromkeys(cameras))
     image_lines = []
     for k, shot in enumerate(shots):
-        image_lines.append(f"{k + 1} {_pose_parameters(shot)} {distinct.index(cameras[k]) + 1} {shot.name}")
+        T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))  # world → camera
+        pose = " ".join(map(_format_number, [*rotation_to_wxyz(T.R[0]), *T.t[0].tolist()]))
+        image_lines.append(f"{k + 1} {pose} {distinct.index(cameras[k]) + 1} {shot.name}")
         image_lines.append(" ".join(observations[k]))
     files = {
         "cameras.txt": [
@@ -107,12 +109,6 @@ def _camera_parameters(shot: ColmapImage) -> str:
     )
     numbers = [fx, fy, cx + 0.5, cy + 0.5, *(distortion + [0.0] * 8)[:length]]
     return " ".join([model, str(shot.hw[1]), str(shot.hw[0]), *map(_format_number, numbers)])
-
-
-def _pose_parameters(shot: ColmapImage) -> str:
-    """Quaternion w, x, y, z and translation of the pose world → camera, as text."""
-    T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
-    return " ".join(map(_format_number, [*rotation_to_wxyz(T.R[0]), *T.t[0].tolist()]))
 
 
 def _format_number(value: float) -> str:

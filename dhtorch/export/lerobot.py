@@ -219,20 +219,12 @@ def make_arrow_schema(
         elif kind is None:
             kind = pyarrow.from_numpy_dtype(np.dtype(feature["dtype"]))
             if len(feature["shape"]) > 1:
-                kind = nested_list_type(kind, len(feature["shape"]))
+                for _ in feature["shape"]:  # lists in lists, as the library datasets stores arrays
+                    kind = pyarrow.list_(kind)
             elif list(feature["shape"]) != [1]:
                 kind = pyarrow.list_(kind, feature["shape"][0])
         fields.append(pyarrow.field(key, kind))
     return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface_metadata(features)})
-
-
-def nested_list_type(kind: Any, depth: int) -> Any:
-    """Arrow type of lists in lists, ``depth`` of them, as the library ``datasets`` stores arrays."""
-    import pyarrow  # noqa: PLC0415
-
-    for _ in range(depth):
-        kind = pyarrow.list_(kind)
-    return kind
 
 
 def nested_lists(values: np.ndarray) -> Any:

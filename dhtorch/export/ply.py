@@ -64,7 +64,9 @@ def write_ply(
     for name, column in columns.items():
         vertex[name] = column
     vertex = vertex[finite]
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {_to_header_text(line)}" for line in comments)]
+    # One line of ASCII a comment, which PLY demands of its header: other characters are escaped.
+    plain = [" ".join(line.split()).encode("ascii", "backslashreplace").decode("ascii") for line in comments]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in plain)]
     header += [f"element vertex {len(vertex)}"]
     header += [f"property {_PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     body = vertex.tobytes()
@@ -75,11 +77,6 @@ def write_ply(
         body += triangles.tobytes()
     storage.replace_file(path, "\n".join([*header, "end_header\n"]).encode("ascii") + body)
     return len(vertex)
-
-
-def _to_header_text(text: str) -> str:
-    """A comment in one line of ASCII, which PLY demands of its header: other characters are escaped."""
-    return " ".join(text.split()).encode("ascii", "backslashreplace").decode("ascii")
 
 
 def _to_ply_number(values: np.ndarray) -> np.ndarray:

@@ -30,6 +30,36 @@ _PREVIEW_OPTIONS: Final = {"crf": "20", "preset": "veryfast"}
 
 
 @contextmanager
+def _open_film(
+    sink: Any,  # a path or an open file
+    encoder: str,
+    rate: Fraction,
+    hw: tuple[int, int],
+    pixels: str,
+    options: Mapping[str, str],
+    *,
+    time_base: Fraction | None = None,  # s; None = a frame
+) -> Iterator[Callable[[Any, int], None]]:
+    """Open an mp4 of one video -> function that encodes a frame of PyAV at a time in units of the time base."""
+    import av  # noqa: PLC0415
+
+    with av.open(sink, "w", format="mp4") as container:
+        stream: Any = container.add_stream(encoder, rate=rate, options=dict(options))
+        stream.height, stream.width = hw
+        stream.pix_fmt = pixels
+        stream.codec_context.thread_count = 1  # the bytes of the file do not depend on the machine
+        if time_base is not None:
+            stream.codec_context.time_base = time_base
+
+        def encode(frame: Any, place: int) -> None:
+            frame.pts, frame.time_base = place, time_base or 1 / rate
+            container.mux(stream.encode(frame))
+
+        yield encode
+        container.mux(stream.encode())
+
+
+@contextmanager
 def open_lossless_video(path: Path, hw: tuple[int, int], fps: float) -> Iterator[AppendFrame]:
     """Open an mp4 -> function that appends an image (h, w, 3) uint8 at a time in s; the file appears at the end.
 
@@ -41,23 +71,15 @@ def open_lossless_video(path: Path, hw: tuple[int, int], fps: float) -> Iterator
     import av  # noqa: PLC0415
 
     # Largest denominator of a frame rate. Source: rates of NTSC, such as 30000 / 1001.
-    rate = Fraction(fps).limit_denominator(1001)
-    with storage.write_atomically(path) as sink, av.open(sink, "w", format="mp4") as container:
-        stream = container.add_stream(_ENCODER, rate=rate, options=dict(_OPTIONS))
-        stream.height, stream.width = hw
-        stream.pix_fmt = "rgb24"
-        stream.codec_context.thread_count = 1  # the bytes of the file do not depend on the machine
-        last = -1
+    rate, last = Fraction(fps).limit_denominator(1001), -1
+    with storage.write_atomically(path) as sink, _open_film(sink, _ENCODER, rate, hw, "rgb24", _OPTIONS) as encode:
 
         def append(picture: np.ndarray, time: float) -> None:
             nonlocal last
             last = max(last + 1, round(time * rate))
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame.pts, frame.time_base = last, 1 / rate
-            container.mux(stream.encode(frame))
+            encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24"), last)
 
         yield append
-        container.mux(stream.encode())
 
 
 def write_preview_video(path: Path, hw: tuple[int, int], pictures: Iterable[np.ndarray], fps: int) -> Path:
@@ -65,22 +87,13 @@ def write_preview_video(path: Path, hw: tuple[int, int], pictures: Iterable[np.n
     import av  # noqa: PLC0415
 
     encoder = next((name for name in _PREVIEW_ENCODERS[:-1] if name in av.codecs_available), _PREVIEW_ENCODERS[-1])
-    options = dict(_PREVIEW_OPTIONS) if encoder == _PREVIEW_ENCODERS[0] else {}
-    with storage.write_atomically(path) as sink, av.open(sink, "w", format="mp4") as container:
-        stream: Any = container.add_stream(encoder, rate=fps, options=options)
-        stream.height, stream.width = hw
-        stream.pix_fmt = "yuv420p"
-        stream.codec_context.thread_count = 1  # the bytes of the file do not depend on the machine
+    options = _PREVIEW_OPTIONS if encoder == _PREVIEW_ENCODERS[0] else {}
+    rate = Fraction(fps)
+    with storage.write_atomically(path) as sink, _open_film(sink, encoder, rate, hw, "yuv420p", options) as encode:
         for k, picture in enumerate(pictures):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame.pts, frame.time_base = k, Fraction(1, fps)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24"), k)
     return path
 
-
-#: Time base of a phone's film: divisible by 24, 25, 30 and 60 Hz.
-_TICKS_PER_S: Final = 600
 
 _H264: Final = {"qp": "0", "preset": "ultrafast"}
 # No B-frames: with them the muxer fails on videos of two frames, at some sizes always, at others sometimes.
@@ -115,11 +128,8 @@ def write_lossless(
 
     encoder, lossless = _LOSSLESS_ENCODERS[pixels]
     file.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(file), "w", format="mp4") as container:
-        stream: Any = container.add_stream(encoder, rate=rate, options=dict(lossless if options is None else options))
-        stream.pix_fmt = pixels
-        stream.height, stream.width = pictures[0].shape[:2]
-        stream.codec_context.thread_count = 1
+    h, w = pictures[0].shape[:2]
+    with _open_film(str(file), encoder, rate, (h, w), pixels, lossless if options is None else options) as encode:
         for i, picture in enumerate(pictures):
             frame = av.VideoFrame(picture.shape[1], picture.shape[0], pixels)
             grey = 128 << 4 * (picture.itemsize - 1)
@@ -129,9 +139,7 @@ def write_lossless(
                     flat = picture.reshape(len(picture), -1)
                     rows[:, : flat.shape[1]] = flat
                 plane.update(rows.tobytes())
-            frame.pts, frame.time_base = i, 1 / rate
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            encode(frame, i)
 
 
 def write_video(
@@ -152,19 +160,13 @@ def write_video(
     import av  # noqa: PLC0415
 
     file.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(file), "w", format="mp4") as container:
-        rate = round(1 / (times[1] - times[0])) if len(times) > 1 else 30
-        stream: Any = container.add_stream(codec, rate=rate)
-        stream.height, stream.width = pictures[0].shape[:2]
-        stream.pix_fmt = stored
-        stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
-        stream.codec_context.thread_count = 1
-        stream.options = {"crf": str(crf), "g": str(key_every), "bf": str(b_frames)}
-        if codec == "libx265":
-            order = f"keyint={key_every}:bframes={b_frames}:log-level=none:pools=none:frame-threads=1"
-            stream.options = {"crf": str(crf), "x265-params": order}
+    rate = round(1 / (times[1] - times[0])) if len(times) > 1 else 30
+    options = {"crf": str(crf), "g": str(key_every), "bf": str(b_frames)}
+    if codec == "libx265":
+        order = f"keyint={key_every}:bframes={b_frames}:log-level=none:pools=none:frame-threads=1"
+        options = {"crf": str(crf), "x265-params": order}
+    h, w = pictures[0].shape[:2]
+    ticks = Fraction(1, 600)  # s; divisible by 24, 25, 30 and 60 Hz
+    with _open_film(str(file), codec, Fraction(rate), (h, w), stored, options, time_base=ticks) as encode:
         for picture, time in zip(pictures, times, strict=True):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = round((time - times[0]) * _TICKS_PER_S), Fraction(1, _TICKS_PER_S)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+            encode(av.VideoFrame.from_ndarray(picture, format="rgb24"), round((time - times[0]) / ticks))

@@ -68,7 +68,11 @@ def write_rh20t(
             planes = [np.concatenate((code & 255, code >> 8)).astype(np.uint8) for code in codes]
             write_lossless(depth_file, planes, "yuvj420p", rate=Fraction(10))
         _save_npy(camera_folder / "timestamps.npy", {"color": stamps, "depth": depth_stamps if depth else []})
-        K[serial] = np.hstack((_full_size_K(frames[0], calibrated_hw), np.zeros((3, 1))))
+        full = K_matrix(frames[0].camera)  # of the full-size image, such that exact scaling gives the frame's own K
+        for axis, size, whole in ((0, frames[0].hw[1], calibrated_hw[1]), (1, frames[0].hw[0], calibrated_hw[0])):
+            full[axis, axis] *= whole / size
+            full[axis, 2] = (full[axis, 2] + 0.5) * whole / size - 0.5
+        K[serial] = np.hstack((full, np.zeros((3, 1))))
         poses = [pose_matrix(frame) for frame in frames]
         c2w = offset @ poses[0] if serial in arm.in_hand else poses[0]
         E[serial] = [np.linalg.inv(c2w), np.eye(4)]
@@ -117,15 +121,6 @@ def _pose_vector(T: np.ndarray) -> np.ndarray:
     """x y z qw qx qy qz."""
     q = rotation_to_xyzw(T[:3, :3])
     return np.array([*T[:3, 3], q[3], *q[:3]])
-
-
-def _full_size_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
-    """K of the full-size image, such that exact scaling gives the frame's own K."""
-    K = K_matrix(frame.camera)
-    for axis, size, full in ((0, frame.hw[1], calibrated_hw[1]), (1, frame.hw[0], calibrated_hw[0])):
-        K[axis, axis] *= full / size
-        K[axis, 2] = (K[axis, 2] + 0.5) * full / size - 0.5
-    return K
 
 
 def _write_streams(

@@ -220,6 +220,8 @@ CASES = [
           "report": ("images of 64x48, cam_params.json states K for 128x96: K is scaled",)}),
     Case("K of another shape is refused", replica, 1, [("cam_params.json", {"camera": STATED_K | {"h": 128}})],
          error="image size: found 128x128, expected 64x48 as the images"),
+    Case("K of another shape, an option", replica, 1, [("cam_params.json", {"camera": STATED_K | {"h": 128}})],
+         {"f": F, "report": ()}, options={"K": OPTION_K}),
     # ScanNet, SensReader, 3RScan
     Case("scannet, depth of another camera", scannet, two_camera_walk, (),
          IN_DEPTH_K | {"same": ([0, 2, 3], 1e-3)}, written={"lost": [1]}),

@@ -168,7 +168,13 @@ class _Load:
         image = torch.from_numpy(files.read_image(self.images[i], hw))
         depth, depth_camera = self.sensor(i)
         depth_hw = (depth.shape[0], depth.shape[1])
-        conf = None if self.confs is None else torch.from_numpy(_read_confidence(self.confs[i], depth_hw))
+        conf = None
+        if self.confs is not None:
+            level = files.read_image(self.confs[i], depth_hw)
+            if level.shape[0] != 1 or level.max() > 2:
+                problem = f"{level.shape[0]} channels up to {level.max()}"
+                raise FormatError(self.confs[i], "confidence", problem, "1 channel of 0, 1 or 2")
+            conf = torch.from_numpy(level[0])
         return Frame(
             image=convert.rot90_image(image, self.turns)[None],
             depth=convert.rot90_image(depth, self.turns)[None],
@@ -222,15 +228,6 @@ def _read_pincam(file: Path) -> tuple[tuple[int, int], Camera]:
         raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of an image")
     hw = (int(h), int(w))
     return hw, convert.to_camera(convert.make_K(fx, fy, cx, cy), hw, file, "intrinsics")
-
-
-def _read_confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
-    """Levels (h, w) uint8, 0 low to 2 high."""
-    level = files.read_image(file, hw)
-    if level.shape[0] != 1 or level.max() > 2:
-        problem = f"{level.shape[0]} channels up to {level.max()}"
-        raise FormatError(file, "confidence", problem, "1 channel of 0, 1 or 2")
-    return level[0]
 
 
 # --------------------------------------------------------------------------------------------- files and time stamps

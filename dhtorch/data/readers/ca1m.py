@@ -132,9 +132,12 @@ class _Load:
         hw = (depth.shape[0], depth.shape[1])
         conf = None
         if "wide/depth/confidence" in self.spans:
-            conf = torch.from_numpy(_decode_confidence(*self.member(i, "wide/depth/confidence"), hw, self.confidence))[
-                None
-            ]
+            data, file = self.member(i, "wide/depth/confidence")
+            value, largest = tiff.decode_tiff(data, file, hw).astype(np.float64), 2 if self.confidence == "level" else 1
+            if not ((value >= 0) & (value <= largest)).all():
+                expected = f"0 to {largest} (option confidence: unit or level)"
+                raise FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
+            conf = torch.from_numpy(np.floor(value * (2 / largest) + 0.5).astype(np.uint8))[None]  # 0 low to 2 high
         return Frame(
             image=image[None],
             depth=depth[None],
@@ -225,13 +228,3 @@ def _parse_matrix(data: bytes, file: Path, n: int) -> np.ndarray:
     value = files.decode_json(data, file)
     flat = isinstance(value, list) and len(value) == n * n
     return files.to_array(value, (n * n,) if flat else (n, n), file, "matrix").reshape(n, n)
-
-
-def _decode_confidence(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
-    """Confidence (h, w) uint8, 0 low to 2 high."""
-    value = tiff.decode_tiff(data, file, hw).astype(np.float64)
-    largest = 2 if stored == "level" else 1
-    if not ((value >= 0) & (value <= largest)).all():
-        expected = f"0 to {largest} (option confidence: unit or level)"
-        raise FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
-    return np.floor(value * (2 / largest) + 0.5).astype(np.uint8)

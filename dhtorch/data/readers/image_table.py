@@ -78,10 +78,10 @@ class ImageTableLoader:
         image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
         units, bits = row.units_per_metre or self.units_per_metre, self.rotated_bits
         if row.depth.suffix.lower() == _PGM_SUFFIX:
-            metres = files.to_metres(rotate_codes(pgm.read_pgm(row.depth, self.depth_hw), bits), units, self.no_return)
+            metres = files.to_metres(_rotate_codes(pgm.read_pgm(row.depth, self.depth_hw), bits), units, self.no_return)
         elif bits:
             code = files.read_depth_png(row.depth, 1, self.depth_hw).astype(np.uint16)
-            metres = files.to_metres(rotate_codes(code, bits), units, self.no_return)
+            metres = files.to_metres(_rotate_codes(code, bits), units, self.no_return)
         else:
             metres = files.read_depth_png(row.depth, units, self.depth_hw, self.no_return)
         depth, depth_camera = torch.from_numpy(metres), self.depth_camera
@@ -125,7 +125,7 @@ def choose_rotated_bits(file: Path, rotated: bool | None, whose: str) -> tuple[i
     return 0, (f"depth codes are not rotated by 3 bits, unlike {whose}: read unrotated (data.rotated=true)",)
 
 
-def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
+def _rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
     """Codes uint16 that are stored rotated to the left by ``bits`` → the codes."""
     return code if bits == 0 else np.right_shift(code, bits) | np.left_shift(code, 16 - bits)
 
@@ -169,13 +169,16 @@ def open_image_table(
         FormatError: no K, or values that are no cameras or poses.
     """
     hw, depth_hw = files.read_image_header(rows[0].image).hw, read_depth_hw(rows[0].depth)
-    (image_K, scaled), (depth_K, depth_scaled) = (
-        fit_stated(each, size) for each, size in ((stated, hw), (depth_stated, depth_hw))
-    )
-    camera, guess = choose_camera(root, hw, image_K, *options, where=where)
-    depth_camera = None if depth_K is None else convert.to_camera(depth_K[0], depth_hw, *depth_K[1:])
+    option, scaled = parse_option(root, hw, *options), tuple[str, ...]()
+    if option.K is not None:
+        camera = convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
+    elif stated is None:
+        raise intrinsics_options.missing_intrinsics_error(root, None, where)
+    else:
+        camera, scaled = _fit_camera(stated, hw)
+    depth_camera, depth_scaled = (None, ()) if depth_stated is None else _fit_camera(depth_stated, depth_hw)
     rows, lost = split_lost(rows)
-    lines, poses = [*report, *scaled, *depth_scaled, *guess, *lost], None
+    lines, poses = [*report, *scaled, *depth_scaled, *option.report, *lost], None
     if all(row.c2w is not None for row in rows):
         poses = convert.to_poses(np.stack([row.c2w for row in rows if row.c2w is not None]), poses_file or root)
     else:
@@ -344,31 +347,6 @@ def read_depth_hw(file: Path) -> tuple[int, int]:
 # ------------------------------------------------------------------------------------------------------ cameras
 
 
-def choose_camera(
-    root: Path,
-    hw: tuple[int, int],
-    stated: tuple[object, Path, str] | None,  # K, its file and its field; None = the capture states none
-    intrinsics: intrinsics_options.IntrinsicsOption | None,
-    K: Sequence[float] | None,
-    fov: float | None,
-    *,
-    where: str,
-) -> tuple[Camera, tuple[str, ...]]:
-    """Camera of the images from the options, else from the capture, and the report of a guess.
-
-    ``where``: the file that would hold K, for the error where it is missing.
-
-    Raises:
-        FormatError: no K, or no camera for an image of size ``hw``.
-    """
-    option = parse_option(root, hw, intrinsics, K, fov)
-    if option.K is not None:
-        return convert.to_camera(convert.make_K(*option.K), hw, root, "option K"), option.report
-    if stated is None:
-        raise intrinsics_options.missing_intrinsics_error(root, None, where)
-    return convert.to_camera(stated[0], hw, *stated[1:]), ()
-
-
 def parse_option(
     root: Path,
     hw: tuple[int, int],
@@ -384,15 +362,11 @@ def parse_option(
     return option
 
 
-def fit_stated(
-    stated: StatedK | None, hw: tuple[int, int]
-) -> tuple[tuple[np.ndarray, Path, str] | None, tuple[str, ...]]:
-    """(K for images of size ``hw``, its file, its field), None where there is none, and the report of scaling."""
-    if stated is None:
-        return None, ()
+def _fit_camera(stated: StatedK, hw: tuple[int, int]) -> tuple[Camera, tuple[str, ...]]:
+    """Camera for images of size ``hw``, and the report of scaling."""
     K, file, field, stated_hw = stated
     K, scaled = fit_K(K, stated_hw or hw, hw, file)
-    return (K, file, field), scaled
+    return convert.to_camera(K, hw, file, field), scaled
 
 
 def fit_K(

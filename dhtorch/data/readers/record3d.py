@@ -13,6 +13,7 @@ positive is *no return*; time stamps count from the first one; ``initPose`` is n
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -108,7 +109,11 @@ def read(
         raise FormatError(inner, "metadata", f"none among {format_count(len(members), 'file')}", _WHOLE_EXPORT)
     meta = _parse_metadata(table, per_frame)
     shots, report = _list_shots(members, inner)
-    shots, uncovered = _select_covered(shots, meta)
+    lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
+    n_rows = min(lengths + ([len(meta.K)] if len(meta.K) > 1 else []), default=math.inf)
+    beyond = [shot.number for shot in shots if shot.number >= n_rows]
+    uncovered = files.format_left_out(beyond, f"beyond the metadata's {n_rows} rows")
+    shots = [shot for shot in shots if shot.number < n_rows]
     c2w, unposed, remarks = _select_posed([shot.number for shot in shots], meta, poses)
     posed = [shot for shot in shots if shot.number not in unposed]
     report += uncovered + remarks + files.format_left_out(sorted(unposed), "its pose is not usable (tracking lost)")
@@ -277,15 +282,6 @@ def _list_shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot],
     gaps = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
     missing |= {"no file": gaps} if gaps else {}
     return shots, [line for reason, numbers in missing.items() for line in files.format_left_out(numbers, reason)]
-
-
-def _select_covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
-    """Frames with a row in every list of the metadata; report of the others."""
-    lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
-    lengths += [len(meta.K)] if len(meta.K) > 1 else []
-    covered = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
-    uncovered = [shot.number for shot in shots if shot not in covered] if len(covered) < len(shots) else []
-    return covered, files.format_left_out(uncovered, f"beyond the metadata's {min(lengths, default=0)} rows")
 
 
 def _select_posed(

@@ -66,7 +66,12 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
         max_step=files.to_positive(max_step, file, "option max_step"),
     )
     number = torch.arange(header.n)
-    times, remarks = _read_times(file, header)
+    stamps, remarks = video.read_video_times(file), list[str]()
+    times = None if header.rate_hz is None else number.double() / header.rate_hz
+    if len(stamps) == header.n:  # from the first frame on, s
+        times = torch.from_numpy(stamps - stamps[0])
+    else:
+        remarks = [f"the file has {len(stamps)} of {header.n} frames: times are those of the nominal rate"]
     return [
         Recording(
             name=file.stem,
@@ -98,16 +103,6 @@ def _load_frame(
     image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
     depth = decode_hue_depth(picture[:, :half], near, far, max_step)
     return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], camera)
-
-
-def _read_times(file: Path, header: video.VideoHeader) -> tuple[torch.Tensor | None, list[str]]:
-    """Time stamps (n,) of the frames from the first one on, s; those of the nominal rate where the file is cut off."""
-    times = video.read_video_times(file)
-    if len(times) == header.n:
-        return torch.from_numpy(times - times[0]), []
-    remark = f"the file has {len(times)} of {header.n} frames"
-    nominal = None if header.rate_hz is None else torch.arange(header.n).double() / header.rate_hz
-    return nominal, [f"{remark}: times are those of the nominal rate"]
 
 
 def decode_hue_depth(

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dhtorch.data import convert
 from dhtorch.data.clocks import nearest_stamps
@@ -149,8 +148,11 @@ def _load_frame(
         planes = read_video_frame(depth, j, (2 * h, w), pixels="gray")
         codes = planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256
         metres = torch.from_numpy(codes) / _UNITS_PER_METRE
-    if outlier > 0:
-        metres = _remove_outliers(metres, outlier)
+    if outlier > 0:  # returns further from the median of their 5×5 window become 0
+        empty = torch.where(metres > 0, metres, torch.full_like(metres, torch.nan))
+        windows = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)
+        median = windows.reshape(h, w, 25).nanmedian(-1).values
+        metres = torch.where((metres - median).abs() > outlier, torch.zeros_like(metres), metres)
     return Frame(image[None], metres[None], camera)
 
 
@@ -331,11 +333,3 @@ def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -
             f"{format_count(lost, f'{kind} frame')} with a time stamp not later than the previous one: left out"
         )
     return kept
-
-
-def _remove_outliers(depth: Tensor, limit: float) -> Tensor:
-    """Depth (h, w) without returns further than ``limit`` m from the median of their 5×5 window; those become 0."""
-    empty = torch.where(depth > 0, depth, torch.full_like(depth, torch.nan))
-    windows = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)
-    median = windows.reshape(*depth.shape, 25).nanmedian(-1).values
-    return torch.where((depth - median).abs() > limit, torch.zeros_like(depth), depth)

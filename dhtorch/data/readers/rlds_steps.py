@@ -23,6 +23,10 @@ _STEPS, _EPISODE = "steps/", "episode_metadata/"
 _INSTRUCTION_FEATURES = ("language_instruction", "natural_language_instruction", "instruction", "task")
 
 
+#: Types of numbers, as TFDS names them.
+_NUMERIC = ("bool", "float32", "float64", "float16", "int8", "int16", "int32", "int64", "uint8", "uint16")
+
+
 @dataclass(frozen=True)
 class EpisodeSteps:
     """The features of one episode's steps, read from its record."""
@@ -47,7 +51,11 @@ class EpisodeSteps:
         body = tfrecord.read_record(load.place.file, load.place.span)
         example = tfrecord.parse_example(body, load.place.file, load.place.span.offset)
         n = len(load.images)
-        readable = {name: f for name, f in load.features.items() if _is_readable(f) and f"{_STEPS}{name}" in example}
+        readable = {}
+        for name, feature in load.features.items():
+            is_array = not feature.encoded and all(size > 0 for size in feature.shape) and feature.dtype in _NUMERIC
+            if f"{_STEPS}{name}" in example and (feature.kind != "tensor" or is_array):
+                readable[name] = feature
         for name, feature in readable.items():
             spans = example[f"{_STEPS}{name}"].spans
             if feature.kind != "tensor" and len(spans) != n:
@@ -110,21 +118,3 @@ class EpisodeSteps:
                 values = tfrecord.read_feature_numbers(self.place.file, name, feature, 1 << 16).tolist()
             metadata[name.removeprefix(_EPISODE)] = values[0] if len(values) == 1 else values
         return metadata
-
-
-def _is_readable(feature: rlds.StepFeature) -> bool:
-    if feature.kind != "tensor":
-        return True
-    is_numeric = feature.dtype in (
-        "bool",
-        "float32",
-        "float64",
-        "float16",
-        "int8",
-        "int16",
-        "int32",
-        "int64",
-        "uint8",
-        "uint16",
-    )
-    return is_numeric and not feature.encoded and all(size > 0 for size in feature.shape)

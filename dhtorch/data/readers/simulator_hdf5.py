@@ -139,7 +139,11 @@ def _make_recording(
     if option.K is not None:
         camera = convert.to_camera(convert.make_K(*option.K), hw, file, "option K")
     elif arrays.K is not None:
-        camera = _read_cameras(arrays.K, n, hw)
+        array = arrays.K
+        if array.shape[1:] != (3, 3):
+            raise FormatError(array.file, array.key, f"an array of {array.shape}", "steps x 3 x 3")
+        matrices = _to_pixel_centres(_read_rows(array, n))
+        camera = convert.to_cameras(matrices, hw, array.file, array.key, None)
     elif "intrinsics" in info:
         camera = convert.to_camera(_to_pixel_centres(info["intrinsics"]), hw, file, "camera_info intrinsics")
     else:
@@ -274,12 +278,6 @@ def _to_pixel_centres(K: Any) -> Any:
     except (TypeError, ValueError, IndexError):
         return K  # refused by the check of K
     return shifted
-
-
-def _read_cameras(array: Hdf5Array, n: int, hw: tuple[int, int]) -> Camera:
-    if array.shape[1:] != (3, 3):
-        raise FormatError(array.file, array.key, f"an array of {array.shape}", "steps x 3 x 3")
-    return convert.to_cameras(_to_pixel_centres(_read_rows(array, n)), hw, array.file, array.key, None)
 
 
 def _read_poses(arrays: _Arrays, n: int, info: dict[str, Any]) -> Pose | None:

@@ -204,7 +204,12 @@ def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool
     if table.is_file():
         rows = [(table, line, words[:2]) for line, words in files.read_rows(table)]
     elif joint is not None:
-        rows = [(joint, line, _find_columns(words, kind)) for line, words in files.read_rows(joint)]
+        # Stamp and name are found by the folder in the names, not by position. Names of other folders: colour stands in
+        # the first two columns, depth in the next two, as in TUM's files.
+        usual, rows = 1 if kind == "rgb" else 3, []
+        for line, words in files.read_rows(joint):
+            place = next((i for i, word in enumerate(words) if Path(word).parent.name == kind), usual)
+            rows.append((joint, line, list(words[max(place - 1, 0) : place + 1])))
     else:
         pictures = image_table.list_images(root / kind)
         rows = [(root / kind, i, [stem, f"{kind}/{pictures[stem].name}"]) for i, stem in enumerate(pictures)]
@@ -221,17 +226,6 @@ def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool
     # Stamps of digits alone are frame numbers below this limit; as seconds it is 11 days after 1970. Source: chosen.
     is_numbered = all(words[0].isdigit() for _, _, words in rows) and max(by_stamp) < 1e6
     return sorted(by_stamp.items()), is_numbered
-
-
-def _find_columns(words: Sequence[str], kind: str) -> list[str]:
-    """Stamp and name of the image of ``kind`` in a line of both: found by the folder in the names, not by position.
-
-    Names of other folders: colour stands in the first two columns, depth in the next two, as in TUM's files.
-    """
-    place = next((i for i, word in enumerate(words) if Path(word).parent.name == kind), None)
-    if place is None:
-        place = 1 if kind == "rgb" else 3
-    return list(words[max(place - 1, 0) : place + 1])
 
 
 def _match_numbers(file: Path, numbers: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
