@@ -99,10 +99,6 @@ def test_known_motion_is_found_and_undone():
     assert torch.equal(aligned[:, 0], moved[:, 0])
 
 
-def given(outcome):
-    return outcome.scenes("given")
-
-
 def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     steps = 1 / torch.tensor([0.1, 0.15, 0.3, 0.7, 1.5])
     near = slope(48, 64, near=0.12, far=1.4)
@@ -113,8 +109,8 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
         tmp_path / "fod", {0: FocalStack(images, depth=near), 1: FocalStack(images.flip(-1), depth=near.flip(-1))}
     )
     outcome = experiment.run([formats.open_stacks(tmp_path / "fod")], {}, None, Settings(), stride_px=1, window_px=3.0)
-    assert set(given(outcome)) == {"fod/000000", "fod/000001"} and outcome.verdict == "undecided"
-    assert all(row["rank_corr"] > 0.9 and row["flip_share"] == 0 for row in given(outcome).values())
+    assert set(outcome.scenes("given")) == {"fod/000000", "fod/000001"} and outcome.verdict == "undecided"
+    assert all(row["rank_corr"] > 0.9 and row["flip_share"] == 0 for row in outcome.scenes("given").values())
     assert outcome.summary["given.flip_share"]["value"] == 0
 
     ten = 1 / torch.linspace(2.0, 1 / 7, 10)[None]
@@ -123,7 +119,7 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     stack = FocalStack((255 * shot).round().to(torch.uint8)[None], depth=far)
     stack_writers.write_ddff12(tmp_path / "d.h5", {"val": [stack]})
     outcome = experiment.run([formats.open_stacks(tmp_path / "d.h5")], {}, None, Settings(), stride_px=1, window_px=3.0)
-    (row,) = given(outcome).values()
+    (row,) = outcome.scenes("given").values()
     assert row["rank_corr"] > 0.9 and row["gated_corr"] > 0.9
 
 
@@ -146,18 +142,18 @@ def test_intervals_resample_rooms_and_not_stacks_of_one_room(tmp_path: Path):
         return experiment.run([formats.open_stacks(tmp_path / "d.h5", **options)], {}, None, Settings(), **asked)
 
     rooms, unknown = run(per_scene=3), run()
-    assert set(given(rooms)) == {"d/train/scene_00", "d/train/scene_01"} and rooms.n_pairs == 5
-    assert [row["n_pairs"] for row in given(rooms).values()] == [3, 2]
-    assert [row["flip_share"] for row in given(rooms).values()] == [pytest.approx(1 / 3), 1.0]
+    assert set(rooms.scenes("given")) == {"d/train/scene_00", "d/train/scene_01"} and rooms.n_pairs == 5
+    assert [row["n_pairs"] for row in rooms.scenes("given").values()] == [3, 2]
+    assert [row["flip_share"] for row in rooms.scenes("given").values()] == [pytest.approx(1 / 3), 1.0]
     summary = rooms.summary["given.rank_corr"]
-    said = [row["rank_corr"] for row in given(rooms).values()]
+    said = [row["rank_corr"] for row in rooms.scenes("given").values()]
     assert summary["n"] == 2 and summary["value"] == pytest.approx(sum(said) / 2)
     assert rooms.summary["given.flip_share"]["value"] == pytest.approx(2 / 3) and said[0] > 0 > said[1]
     stacks = [r for r in rooms.rows if r["pair"] is not None and r["method"] == "given"]
     assert [r["pair"] for r in stacks] == [[i, i] for i in range(5)] and all(
         r["n_candidates"] == 48 * 64 for r in stacks
     )
-    assert list(given(unknown)) == ["d/train"] and unknown.summary["given.rank_corr"]["n"] == 1
+    assert list(unknown.scenes("given")) == ["d/train"] and unknown.summary["given.rank_corr"]["n"] == 1
     assert unknown.summary["given.rank_corr"]["low"] is None, "one room has no interval"
 
 

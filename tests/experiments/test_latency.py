@@ -81,12 +81,6 @@ def test_ratios_are_taken_round_by_round():
     assert [summary["a.speedup"][k] for k in ("value", "low", "high")] == [50, 50, 50]
 
 
-def test_percentiles():
-    times = [float(k) for k in range(101)]
-    assert [latency.percentile(times, q) for q in (0.5, 0.95, 0.99)] == [50, 95, 99]
-    assert latency.percentile([1.0, 2.0], 0.5) == 1.5 and latency.percentile([7.0], 0.99) == 7
-
-
 def hungry(x, mib):
     return x.sum() + (x.new_ones(mib * 2**20 // x.element_size()) + 1).sum()
 
@@ -126,8 +120,17 @@ def test_dinov2_shapes_seed_and_local_weights(tmp_path):
         dinov2.load_dinov2(tmp_path / "nowhere")
 
 
-def test_pixel_values_are_centred():
-    grey = dinov2.preprocess_image(torch.full((1, 1, 30, 30), 0.5), 28)
-    expected = (0.5 - torch.tensor(dinov2.COLOUR_MEAN)) / torch.tensor(dinov2.COLOUR_STD)
-    assert grey.shape == (1, 3, 28, 28) and torch.allclose(grey[0].mean((-1, -2)), expected, atol=1e-6)
-    assert torch.allclose(dinov2.preprocess_image(torch.full((1, 1, 30, 30), 51, dtype=torch.uint8), 28)[0, 0, 0, 0], (0.2 - torch.tensor(0.485)) / 0.229)  # fmt: skip
+@pytest.mark.parametrize(
+    ("times", "q", "expected"),
+    [*((range(101), q, 100 * q) for q in (0.5, 0.95, 0.99)), ([1.0, 2.0], 0.5, 1.5), ([7.0], 0.99, 7)],
+)
+def test_percentiles(times, q, expected):
+    assert latency.percentile([float(t) for t in times], q) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(0.5, torch.float32), (51, torch.uint8)])
+def test_pixel_values_are_centred(value, dtype):
+    found = dinov2.preprocess_image(torch.full((1, 1, 30, 30), value, dtype=dtype), 28)
+    grey = value / 255 if dtype == torch.uint8 else value
+    expected = (grey - torch.tensor(dinov2.COLOUR_MEAN)) / torch.tensor(dinov2.COLOUR_STD)
+    assert found.shape == (1, 3, 28, 28) and torch.allclose(found[0].mean((-1, -2)), expected, atol=1e-6)
