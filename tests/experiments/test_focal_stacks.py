@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 import torch
@@ -18,7 +20,8 @@ from support.writers import focal as stack_writers
 from dhtorch import data
 from dhtorch.cli import run
 from dhtorch.data import FormatError
-from dhtorch.experiments.focal import formats
+from dhtorch.data.codecs import tiff
+from dhtorch.experiments.focal import fod500, formats
 from dhtorch.experiments.focal.ddff12 import refocus
 from dhtorch.experiments.focal.stacks import FocalStacks
 
@@ -43,6 +46,21 @@ def test_fod500_gives_back_pictures_depth_and_lens(tmp_path: Path, monkeypatch: 
     assert torch.equal(pickle.loads(pickle.dumps(stacks))[-1].images, want[400].images) and len(list(stacks)) == 3
     assert formats.open_stacks(tmp_path, split="val").names == ("000400",)
     assert formats.open_stacks(tmp_path, split="train").names == ("000000", "000007")
+    depth = want[0].depth.clone()
+    depth[0, 0, :4] = torch.tensor([5.0, math.nan, -1.0, math.inf])
+    stack_writers.write_fod500(tmp_path / "b", {0: want[0].replace(depth=depth)})
+    assert formats.open_stacks(tmp_path / "b")[0].depth[0, 0, :4].tolist() == [3, 0, 0, 0]
+    assert formats.open_stacks(tmp_path / "b", max_depth=None)[0].depth[0, 0, 0] == 5
+    planes = {c: np.full((12, 16), v, np.float16) for c, v in (("R", 1.5), ("G", 2.5), ("B", 0.5))}
+    file = OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, planes)
+    file.write(str(tmp_path / "b/000000Dpt.exr"))
+    image = random_stack(3).images[0, 0].permute(1, 2, 0).numpy()
+    tifffile.imwrite(tmp_path / "b/000000_00All.tif", image, compression="lzw", predictor=True, photometric="rgb")
+    got = formats.open_stacks(tmp_path / "b")[0]
+    assert bool((got.depth == 1.5).all()) and torch.equal(got.images[0, 0], random_stack(3).images[0, 0])
+    for module, name in ((tiff, "read_tiff"), (fod500.exr, "read_exr")):
+        monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
+    assert len(formats.open_stacks(tmp_path)) == 3, "opening decodes nothing"
 
 
 def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_path: Path) -> None:
@@ -173,6 +191,9 @@ def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
         stack_writers.write_light_field(tmp_path / "raw", scene, number, lf)
     raw = formats.open_stacks(tmp_path / "raw")
     assert raw.by_scene() == {"test/library": [0], "train/kitchen": [1, 2], "train/studentlab": [3]}
+    stack_writers.write_light_field(tmp_path / "some", "train/kitchen", 0, lf, torch.ones(1, 12, 16))
+    stack_writers.write_light_field(tmp_path / "some", "train/kitchen", 1, lf)
+    assert formats.open_stacks(tmp_path / "some").report == ("train/kitchen/0001: no DEPTH_0001.png: left out",)
     assert formats.open_stacks(tmp_path / "raw", split="test").by_scene() == {"test/library": [0]}
 
     file = tmp_path / "a.h5"
