@@ -12,7 +12,7 @@ import torch
 from dhtorch.cli.run import main
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
-from dhtorch.experiments import protocol, screening
+from dhtorch.experiments import protocol
 from dhtorch.experiments.finished_scenes import FinishedScenes
 from dhtorch.experiments.outcome import Outcome
 from dhtorch.experiments.paper import hole_census
@@ -131,10 +131,10 @@ def test_a_damaged_or_foreign_scene_is_computed_again(command, computed):
 
 @pytest.mark.slow
 def test_experiments_with_loops_of_their_own_keep_their_scenes(command, monkeypatch, tmp_path):
-    """hole_census has a loop of its own, helix_correlation that of the screening."""
+    """hole_census has a loop of its own, helix_correlation that of the protocol."""
     for experiment, module, name in (
         ("hole_census", hole_census, "_join_frames"),
-        ("helix_correlation", screening, "_join_rows"),
+        ("helix_correlation", protocol, "_join_rows"),
     ):
         options = [f"experiment={experiment}"]
         assert command(*ROOMS, *options, f"output={experiment}")[0] == 0

@@ -3,7 +3,7 @@
 import random
 
 from dhtorch.codes import Gate, Hole, names
-from dhtorch.experiments.rows import summarise_rows
+from dhtorch.experiments.outcome import summarise_rows
 from dhtorch.metrics import errors
 from dhtorch.runtime import results as result_files
 

@@ -30,10 +30,8 @@ from dhtorch.codes import is_estimated
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments import protocol
-from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
-from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings
-from dhtorch.experiments.rows import Row
+from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars
+from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress, spread_pairs
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import sample_nearest
@@ -145,7 +143,7 @@ def run(
     size: int = 320,
     swept: bool = False,
     faults: Sequence[str] | None = None,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors of faulty maps after alignment by :func:`dhtorch.alignment.align.align_depth` and by global fits.
 
@@ -182,7 +180,7 @@ def run(
             return Outcome([_scene_row(scene, _OURS, None) | {"note": note}])
         assert near is not None
         case_rows: dict[tuple[str, str], list[Row]] = {}
-        frames = sorted({pair[0] for pair in protocol.spread_pairs(pairs, reference_views, scene)})
+        frames = sorted({pair[0] for pair in spread_pairs(pairs, reference_views, scene)})
         for i in progress(frames, scene.name, len(frames)):
             case = _make_case(scene, i, method, settings, near, size=size, swept=swept)
             for name, method_name, row in _evaluate_case(case, names, i):

@@ -28,9 +28,8 @@ from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import stereo
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
-from dhtorch.experiments.outcome import Bars, join_outcomes, judge_bars
+from dhtorch.experiments.outcome import Bars, Row, join_outcomes, judge_bars
 from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.filters import grayscale

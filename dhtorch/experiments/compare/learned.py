@@ -26,6 +26,7 @@ from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import memory, protocol
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.baselines.relative import RelativeDepth, sample_relative_depth, to_estimate
+from dhtorch.experiments.outcome import Row, median_or_none, summarise_rows
 from dhtorch.experiments.protocol import (
     Batch,
     Method,
@@ -37,7 +38,6 @@ from dhtorch.experiments.protocol import (
     Variant,
     no_progress,
 )
-from dhtorch.experiments.rows import Row, median_or_none, summarise_rows
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.patches import round_half_up
 from dhtorch.metrics import errors, holdout

@@ -23,8 +23,8 @@ from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import xfeat
+from dhtorch.experiments.outcome import Row
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.uncertainty import disjoint_agreement

@@ -24,9 +24,8 @@ from dhtorch.codes import PinReason, PinVerdict, name
 from dhtorch.data import open_all, scenes_root
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
+from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.measure import CameraPin

@@ -29,10 +29,8 @@ import torch
 from dhtorch.data.models import ModelView, SceneModel, Similarity
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments import protocol
-from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
-from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings
-from dhtorch.experiments.rows import Row
+from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars
+from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
@@ -106,7 +104,7 @@ def run(
     sound: int = 10,
     repeats: int = 2,
     max_frames: int = 40,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Sizes and refusals of models that are made of the scenes and of built-in rooms.
 

@@ -23,9 +23,8 @@ from dhtorch.codes import State, WrongCause, describe
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import Bars, MainMetric, judge_bars
+from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars, mean_or_none
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row, mean_or_none
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.patches import rescale_field_of_view, sample_nearest

@@ -30,10 +30,17 @@ from dhtorch.experiments.focal.blur import (
     guess_side_by_height,
     inverse_depth_from_blur,
 )
-from dhtorch.experiments.outcome import MainMetric
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row, median_or_none
-from dhtorch.experiments.screening import ScreenedItem, screen_scenes
+from dhtorch.experiments.outcome import MainMetric, Row, median_or_none
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    screen_scenes,
+)
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, spot_diameter
 from dhtorch.metrics import bootstrap, holdout
 from dhtorch.metrics.correlation import pearson, spearman

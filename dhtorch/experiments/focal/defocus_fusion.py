@@ -25,10 +25,18 @@ from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.focal.blur import estimate_blur
 from dhtorch.experiments.focal.defocus import has_exact_depth
 from dhtorch.experiments.focal.filling import fill_bilinear, fill_defocus_guided, fill_guided, fill_joint_bilateral
-from dhtorch.experiments.outcome import MainMetric
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
+from dhtorch.experiments.outcome import MainMetric, Row
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    paired_metric,
+    screen_scenes,
+)
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import pearson
 from dhtorch.records import Frame

@@ -28,10 +28,17 @@ from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments.focal.defocus import has_exact_depth
 from dhtorch.experiments.focal.sharpness import align_stack, depth_at_focus, find_sharpest, measure_sharpness
 from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
-from dhtorch.experiments.outcome import MainMetric
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row, mean_or_none
-from dhtorch.experiments.screening import ScreenedItem, screen_scenes
+from dhtorch.experiments.outcome import MainMetric, Row, mean_or_none
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    screen_scenes,
+)
 from dhtorch.geometry import filters
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import pearson, spearman

@@ -25,10 +25,18 @@ from torch import Tensor
 
 from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import MainMetric
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row, median_or_none
-from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
+from dhtorch.experiments.outcome import MainMetric, Row, median_or_none
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    paired_metric,
+    screen_scenes,
+)
 from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
 from dhtorch.metrics import bootstrap, holdout

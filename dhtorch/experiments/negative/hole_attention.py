@@ -20,11 +20,19 @@ from torch import Tensor
 
 from dhtorch.codes import Hole
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import MainMetric, Row
 from dhtorch.experiments.paper.hole_census import classify_frame, count_holes
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    paired_metric,
+    screen_scenes,
+)
 from dhtorch.geometry.checks import check
 from dhtorch.metrics import bootstrap
 from dhtorch.pytree import Record, record

@@ -24,10 +24,18 @@ from torch import Tensor
 
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import MainMetric
-from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
+from dhtorch.experiments.outcome import MainMetric, Row
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    ScenePairs,
+    ScreenedItem,
+    Settings,
+    no_progress,
+    paired_metric,
+    screen_scenes,
+)
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.least_squares import gauss_newton_step, select_batch

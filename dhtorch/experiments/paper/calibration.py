@@ -14,9 +14,8 @@ from typing import Any
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, hide_nothing
-from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.outcome import Row, join_outcomes, summarise_rows
 from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-from dhtorch.experiments.rows import Row, summarise_rows
 from dhtorch.metrics import bootstrap, errors, reliability, risk
 
 QUESTION = "Does the score order answers by risk, and is it a probability?"

@@ -23,8 +23,8 @@ from dhtorch.experiments.cohorts import (
     trajectory_pose,
     trajectory_pose_fit,
 )
+from dhtorch.experiments.outcome import Row
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 
 QUESTION = "Is the device's own trajectory good enough to triangulate with?"

@@ -19,9 +19,8 @@ import torch
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, hide_nothing
-from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.outcome import Row, join_outcomes
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
-from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 
 QUESTION = "How accurate is triangulated depth, scene by scene, at points that the pose was not fitted to?"

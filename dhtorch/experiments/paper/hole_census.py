@@ -16,9 +16,8 @@ import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import MainMetric, Row, mean_or_none, median_or_none
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row, mean_or_none, median_or_none
 from dhtorch.metrics import errors
 from dhtorch.records import Samples
 

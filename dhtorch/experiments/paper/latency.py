@@ -32,9 +32,8 @@ from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import memory
 from dhtorch.experiments.baselines import dinov2 as visual
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import MainMetric, Row
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.metrics import holdout
 from dhtorch.metrics.bootstrap import Interval

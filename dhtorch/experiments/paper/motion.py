@@ -17,11 +17,10 @@ import torch
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut
-from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.outcome import Row, join_outcomes
 from dhtorch.experiments.paper.gate_ablation import pairs_at_gaps, sweep_gaps
 from dhtorch.experiments.paper.heldout import recovery_columns
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, ScenePairs, Settings
-from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import spearman
 

@@ -27,9 +27,8 @@ from dhtorch.experiments.cohorts import (
     missing_truth_reason,
     trajectory_pose_fit,
 )
-from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.outcome import Row, join_outcomes
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Estimate, Frame

@@ -28,10 +28,9 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.outcome import MainMetric
+from dhtorch.experiments.outcome import MainMetric, Row
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.protocol import Outcome
-from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.runtime import results as result_files

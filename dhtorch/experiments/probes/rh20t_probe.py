@@ -40,6 +40,7 @@ from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2 as visual_branch
+from dhtorch.experiments.outcome import Row
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.probes.probing import (
@@ -60,7 +61,6 @@ from dhtorch.experiments.probes.probing import (
     ProbeShards,
 )
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
 
 QUESTION = "Do depth features predict a robot's next motion as well as DINOv2's in a ridge probe?"
 EXPECTATION = "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move."

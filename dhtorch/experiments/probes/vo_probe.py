@@ -28,6 +28,7 @@ from torch import Tensor
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2 as visual_branch
+from dhtorch.experiments.outcome import Row
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
@@ -45,7 +46,6 @@ from dhtorch.experiments.probes.probing import (
     ProbeShards,
 )
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.records import Frame
