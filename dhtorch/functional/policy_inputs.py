@@ -1,4 +1,4 @@
-"""Depth as what policies without a depth input take: a picture of three channels, or points.
+"""Depth as what policies without a depth input take: an image of three channels, or points.
 
 A geometry image has one byte per channel and pixel, and (0, 0, 0) where there is no depth:
 
@@ -63,18 +63,18 @@ def geometry_image(
     sigma: Tensor,  # (*, H, W) m; 0 or not finite = unknown
     source: Tensor,  # (*, H, W) codes.Source; 0 = none
 ) -> Tensor:
-    """Encode inverse depth, relative sigma and source as a picture: (*, 3, H, W) uint8.
+    """Encode inverse depth, relative sigma and source as an image: (*, 3, H, W) uint8.
 
     Args:
         depth, sigma, source: maps as ``ExtendDepth(dense=True)`` adds them.
 
     Returns:
-        Picture; its codes are in the documentation of this module.
+        Image; its codes are in the documentation of this module.
 
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: none, the picture is of whole numbers.
+    Gradient: none, the image is of whole numbers.
 
     Example:
         >>> depth, sigma = torch.tensor([[0.5, 2.0, 0.0]]), torch.tensor([[0.005, 0.1, 0.0]])
@@ -100,10 +100,10 @@ def decode_geometry_image(
     """Decode a geometry image: depth, sigma and source, within half a code of what was encoded.
 
     Args:
-        image: picture of :func:`geometry_image`; loaders that divide by 255 are undone exactly.
+        image: image of :func:`geometry_image`; loaders that divide by 255 are undone exactly.
 
     Returns:
-        Maps in float32 (the dtype of a floating-point picture). Whether a pixel has a depth is by channel 2 alone.
+        Maps in float32 (the dtype of a floating-point image). Whether a pixel has a depth is by channel 2 alone.
 
     Raises:
         ValueError: wrong shape.
@@ -136,7 +136,7 @@ def point_cloud(
 ) -> Tensor:
     """Points of ``n`` pixels of a depth map in the camera's axes (x right, y down, z forward): (*, n, 3) m.
 
-    The pixels are those with a depth that come first in a fixed order that covers the picture evenly; no random number
+    The pixels are those with a depth that come first in a fixed order that covers the image evenly; no random number
     is drawn, and the first points of a larger ``n`` are those of a smaller one. Where fewer than ``n`` pixels have a
     depth, their points repeat in the same order; without any depth all points are 0.
 
@@ -176,7 +176,7 @@ def point_cloud(
 
 
 def _pixel_order(h: int, w: int, device: torch.device) -> Tensor:
-    """Indices (h · w,) of the pixels in an order whose first ones cover the picture evenly."""
+    """Indices (h · w,) of the pixels in an order whose first ones cover the image evenly."""
     v = torch.arange(h, device=device)[:, None]
     u = torch.arange(w, device=device)
     return ((v * _ROW_STEP + u * _COLUMN_STEP) % 2**32).reshape(-1).argsort(stable=True)

@@ -1,12 +1,12 @@
-"""Coarse flow: two images -> motion of the whole picture on a grid of cells, by correlation, without training.
+"""Coarse flow: two images -> motion of the whole image on a grid of cells, by correlation, without training.
 
-Alphabet: a, b the small pictures of image 0 and 1, (B, h, w); ``k`` the number of image pixels per small pixel along an
+Alphabet: a, b the small images of image 0 and 1, (B, h, w); ``k`` the number of image pixels per small pixel along an
 axis; K = R x C *cells*, windows of a on a regular grid; A a similarity (rotation and zoom) about the centres of both
-pictures, one of ``G`` candidates; V (…, D, D) the correlation of a cell at its position under A plus an integer offset.
+images, one of ``G`` candidates; V (…, D, D) the correlation of a cell at its position under A plus an integer offset.
 
-Every cell is correlated with the other picture within its search range; ambiguous cells are resolved by their
+Every cell is correlated with the other image within its search range; ambiguous cells are resolved by their
 neighbours (belief propagation along the four directions of the grid, with a cost that grows with the change of motion
-up to a limit). Gain and bias cancel in the correlation. Rotation and zoom are estimated first, on pictures of half the
+up to a limit). Gain and bias cancel in the correlation. Rotation and zoom are estimated first, on images of half the
 size, among a few candidates; a candidate is accepted if it fits better than the identity by a margin.
 
 All sums are of integers that a float represents exactly: the result depends on no order of summation, so not on the
@@ -27,7 +27,7 @@ from dhtorch.geometry.checks import any_possible, check, constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.pytree import Record, record
 
-#: Longest side of the small pictures for the flow, px.
+#: Longest side of the small images for the flow, px.
 COARSE_SIDE_PX = 64
 
 #: Width of a cell's window in the flow, small pixels, odd.
@@ -39,7 +39,7 @@ ROTATIONS_DEG = (0.0, -30.0, -15.0, 15.0, 30.0)
 #: Mean correlation by which a candidate must exceed that of the identity.
 MIN_CORRELATION_GAIN = 0.03
 
-#: Largest grey value of a small picture, in integer steps.
+#: Largest grey value of a small image, in integer steps.
 GREY_LEVELS = 1023
 
 #: Length of a normalised window, in integer steps; its square is a correlation of 1, and sums of products over a window
@@ -118,7 +118,7 @@ def coarse_flow(
     check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"), linear=(linear, "B 2 2"))
     small_0, small_1 = downscale(image_0, COARSE_SIDE_PX), downscale(image_1, COARSE_SIDE_PX)
     a, b = _quantised(small_0), _quantised(small_1)
-    scale_ratio = small_1.scale / small_0.scale  # from here on similarities map small pictures
+    scale_ratio = small_1.scale / small_0.scale  # from here on similarities map small images
     if linear is None:
         similarity = _best_similarity(image_0, image_1, reach, rotations_deg, zooms)
         identity = torch.eye(2, device=a.device).expand_as(similarity)
@@ -154,7 +154,7 @@ def apply_similarity(
     uv: Tensor,  # (B, N, 2) px
     hw: tuple[int, int],
 ) -> Tensor:
-    """Pixels (B, N, 2) of the upright picture -> pixels of the image, rotated and zoomed about its centre.
+    """Pixels (B, N, 2) of the upright image -> pixels of the image, rotated and zoomed about its centre.
 
     Under the identity they are unchanged, bit for bit. Gradient: to both.
     """
@@ -168,7 +168,7 @@ def undo_similarity(
     linear: Tensor,  # (B, 2, 2) rotation and zoom
     gain: Tensor,  # (B,)
 ) -> Tensor:
-    """Image -> grey picture (B, 1, H, W) without rotation, zoom and gain: its pixel x is the image at
+    """Image -> grey image (B, 1, H, W) without rotation, zoom and gain: its pixel x is the image at
     ``apply_similarity(linear, x)``, its grey values divided by ``gain``.
 
     Beyond the image its border repeats. Under the identity and gain 1 the grey values are unchanged, bit for bit.
@@ -194,7 +194,7 @@ def is_not_identity(linear: Tensor) -> Tensor:
 
 
 class DownscaledImage(NamedTuple):
-    """A small picture, each pixel the mean of a square of image pixels."""
+    """A small image, each pixel the mean of a square of image pixels."""
 
     grey: Tensor  # (B, 1, h, w) in [0, 1]
     scale: int  # image pixels per small pixel along an axis
@@ -206,7 +206,7 @@ class DownscaledImage(NamedTuple):
 
 
 def downscale(image: Tensor, long: int) -> DownscaledImage:
-    """Image (B, C, H, W) -> grey picture with a longer side of at most ``long``; a smaller image keeps its size.
+    """Image (B, C, H, W) -> grey image with a longer side of at most ``long``; a smaller image keeps its size.
 
     In squares of sixteen pixels and more only every so many rows and columns are averaged: a hundred pixels give about
     the same mean as a thousand. Gradient: to the image.
@@ -220,7 +220,7 @@ def downscale(image: Tensor, long: int) -> DownscaledImage:
 
 
 def _grey(image: Tensor) -> Tensor:
-    """Grey picture (B, 1, H, W) in single precision at least."""
+    """Grey image (B, 1, H, W) in single precision at least."""
     picture = grayscale(image)
     return picture.to(torch.promote_types(picture.dtype, torch.float32))
 
@@ -229,7 +229,7 @@ def _best_similarity(
     image_0: Tensor, image_1: Tensor, reach: float, rotations_deg: tuple[float, ...], zooms: tuple[float, ...]
 ) -> Tensor:
     """Two images -> similarity (B, 2, 2) of the candidates with the highest mean correlation."""
-    # Longest side of the small pictures for rotation and zoom, px.
+    # Longest side of the small images for rotation and zoom, px.
     a, b = (_quantised(downscale(image, 32)) for image in (image_0, image_1))
     like = a.new_empty(0, dtype=torch.get_default_dtype())
     angle = constant(like, [math.radians(t) for z in zooms for t in rotations_deg])
@@ -245,13 +245,13 @@ def _best_similarity(
 
 
 def _quantised(picture: DownscaledImage) -> Tensor:
-    """Small picture -> integer grey values (B, h, w) from 0 to ``GREY_LEVELS``."""
+    """Small image -> integer grey values (B, h, w) from 0 to ``GREY_LEVELS``."""
     return (picture.grey[:, 0] * GREY_LEVELS).round()
 
 
 def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int) -> tuple[Tensor, ...]:
-    """Pictures a, b and candidates A -> cell centres (R, C, 2), offsets to b (B, G, R, C, 2), small px, correlations
-    (B, G, R, C), and mean correlation (B, G) of the cells that A maps into the picture."""
+    """Images a, b and candidates A -> cell centres (R, C, 2), offsets to b (B, G, R, C, 2), small px, correlations
+    (B, G, R, C), and mean correlation (B, G) of the cells that A maps into the image."""
     (h, w), (h_1, w_1) = a.shape[-2:], b.shape[-2:]
     R, C = (max(2, round(n / step)) for n in (h, w))
     v, u = ((torch.arange(m, device=a.device) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
@@ -314,8 +314,8 @@ def _variance(windows: Tensor) -> Tensor:
 
 
 def _flat_variance(picture: Tensor) -> Tensor:
-    """Variance (B,) of grey levels, of a picture (B, h, w), that regularises the contrast of flat windows."""
-    # Contrast of a window over that of the whole picture, a ratio of standard deviations, that regularises flat
+    """Variance (B,) of grey levels, of an image (B, h, w), that regularises the contrast of flat windows."""
+    # Contrast of a window over that of the whole image, a ratio of standard deviations, that regularises flat
     # windows.
     # Lower limit of that regularising standard deviation, grey levels.
     return (0.05**2 * _variance(picture.flatten(1))).clamp_min(2.0**2)
@@ -333,7 +333,7 @@ def _normalise(windows: Tensor, floor: Tensor) -> Tensor:
 
 
 def _crop_scores(S: Tensor, centre: Tensor, radius: int) -> Tensor:
-    """Crops (B, G, R, C, D, D) of S within ``radius`` of ``centre`` (B, G, R, C, 2); 0 outside the picture."""
+    """Crops (B, G, R, C, D, D) of S within ``radius`` of ``centre`` (B, G, R, C, 2); 0 outside the image."""
     h, w = S.shape[-2:]
     o = torch.arange(-radius, radius + 1, device=S.device)
     u, v = centre[..., 0, None] + o, centre[..., 1, None] + o
@@ -372,7 +372,7 @@ def _max_3x3(x: Tensor) -> Tensor:
 
 
 def _smooth_offsets(offset: Tensor, cell_weight: Tensor) -> Tensor:
-    """Offsets (B, R, C, 2) -> weighted means of their neighbourhood; of the whole picture where its weights are 0."""
+    """Offsets (B, R, C, 2) -> weighted means of their neighbourhood; of the whole image where its weights are 0."""
     weight = cell_weight[..., None]
     weighted = offset * weight
     smoothed, weight_sum = _binomial(weighted), _binomial(weight)

@@ -1,4 +1,4 @@
-"""Filters of whole pictures: grey values, Gaussian and box blur, separable correlation; rounding independent of batch.
+"""Filters of whole images: grey values, Gaussian and box blur, separable correlation; rounding independent of batch.
 
 Grey values and Gaussian blur are kornia's; filters of few taps are sums of shifted copies instead of a convolution.
 
@@ -18,13 +18,13 @@ from dhtorch.geometry.checks import check
 
 
 def grayscale(image: Tensor) -> Tensor:
-    """Pictures (B, C, H, W) -> grey values (B, 1, H, W) in [0, 1]; BT.601.
+    """Images (B, C, H, W) -> grey values (B, 1, H, W) in [0, 1]; BT.601.
 
-    C is 1 or 3, the pictures are float in [0, 1] or uint8. By kornia: bit for bit the values of
+    C is 1 or 3, the images are float in [0, 1] or uint8. By kornia: bit for bit the values of
     :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is for patches and reads channels along any
     axis. Bytes become float32, divided first.
 
-    Gradient: to the picture.
+    Gradient: to the image.
     """
     from kornia.color import rgb_to_grayscale  # noqa: PLC0415  (imported where it is used: 0.2 s)
 
@@ -33,7 +33,7 @@ def grayscale(image: Tensor) -> Tensor:
 
 
 def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
-    """Pictures (B, C, H, W) -> correlation with the taps ``down`` along the height and ``across`` along the width.
+    """Images (B, C, H, W) -> correlation with the taps ``down`` along the height and ``across`` along the width.
 
     Raises:
         ValueError: wrong shape, or an even number of taps.
@@ -65,9 +65,9 @@ def gaussian_taps(sigma_px: float, derivative: bool = False) -> list[float]:
 
 
 def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tensor:
-    """Pictures (B, C, H, W) -> blurred by a Gaussian up to four sigma, by kornia; unchanged for sigma 0.
+    """Images (B, C, H, W) -> blurred by a Gaussian up to four sigma, by kornia; unchanged for sigma 0.
 
-    Picture by picture, because for more pixels kornia uses an implementation that rounds differently.
+    Image by image, because for more pixels kornia uses an implementation that rounds differently.
 
     Raises:
         ValueError: wrong shape, or a negative sigma.
@@ -85,7 +85,7 @@ def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) ->
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Pictures (B, C, H, W) -> means over squares of ``2 radius + 1`` pixels. Gradient: to ``x``."""
+    """Images (B, C, H, W) -> means over squares of ``2 radius + 1`` pixels. Gradient: to ``x``."""
     side = 2 * radius + 1
     return correlate_separable(x, [1 / side] * side, [1 / side] * side)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.covariance import masked_median
 
-#: Approximate number of samples in a cell of the picture.
+#: Approximate number of samples in a cell of the image.
 SAMPLES_PER_CELL = 10
 
 #: Lower limit of the number of answers that are tested.
@@ -34,7 +34,7 @@ def free_space_violations(
         uv: samples.
         sensed: depth of the sensor at the samples.
         pose_returns: returns that the pose is estimated from; their median depth is within the range of the sensor.
-        candidates: answers at samples whose return is missing for no other reason. Only those in cells of the picture
+        candidates: answers at samples whose return is missing for no other reason. Only those in cells of the image
             without any return are tested: small holes between returns are usual.
         depth, sigma: depth of the answers and its standard deviation.
 

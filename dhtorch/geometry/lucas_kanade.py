@@ -321,7 +321,7 @@ def compare_windows(
     uv_0: Tensor,  # (B, N, 2) px
     uv_1: Tensor,  # (B, N, 2) px
 ) -> tuple[Tensor, Tensor]:
-    """Windows of two pictures around points -> rms grey difference (B, N), and whether the first has texture (B, N)."""
+    """Windows of two images around points -> rms grey difference (B, N), and whether the first has texture (B, N)."""
     B, N, _ = uv_0.shape
     fill = round_up(B * N) - B * N
     like = source.levels[0]

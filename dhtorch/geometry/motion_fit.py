@@ -35,12 +35,12 @@ FINAL_BEND = 3.0
 
 
 class Sightings(NamedTuple):
-    """Points of a reference view and where another picture shows them."""
+    """Points of a reference view and where another image shows them."""
 
     xyz: Tensor  # (B, 3, N) m in the reference camera; rays with z = 1 where there is no depth
-    uv: Tensor  # (B, 2, N) ideal px in the picture
+    uv: Tensor  # (B, 2, N) ideal px in the image
     used: Tensor  # (B, N) bool
-    f: Tensor  # (B, 2) px, of the picture's camera
+    f: Tensor  # (B, 2) px, of the image's camera
     c: Tensor  # (B, 2) px
 
     @property
@@ -65,7 +65,7 @@ def fit_motion(
     """The motion on which most tracks agree: reweighted least squares from several starts, the best of which is kept.
 
     Args:
-        seen: of one picture, B = 1.
+        seen: of one image, B = 1.
         starts: (S) poses live from reference.
         group: (N,) long, groups of neighbours, whose errors are common.
         overlap: windows over an area, a count at least 1: so many tracks count as one in the model's covariance.
@@ -132,13 +132,13 @@ def _noise(r: Tensor, usable: Tensor) -> Tensor:
     """Noise (B,) of a coordinate, px, from the median length of the residuals that are no outliers."""
     length = r.square().sum(1).sqrt()
     median = masked_median(length, usable & (length < 3 * FIT_BENDS_PX[-1]))[:, 0]
-    # Limits of the noise of a track, px: below, exact copies of a picture; above, nothing is followed. Source:
+    # Limits of the noise of a track, px: below, exact copies of an image; above, nothing is followed. Source:
     # derived, an eighth of the rounding to whole pixels over sqrt(12); the last of ``FIT_BENDS_PX``.
     return (median / MEDIAN_2D).clamp(0.036, 1.0)
 
 
 def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:
-    """Start (B): the rotation about two axes that moves the picture by the median flow from rays (B, 3, N), z = 1."""
+    """Start (B): the rotation about two axes that moves the image by the median flow from rays (B, 3, N), z = 1."""
     x, y = (masked_median(seen.plane[:, k] - ray_0[:, k], seen.used)[:, 0] for k in range(2))
     has_tracks = seen.used.any(-1)
     turn = torch.stack((torch.where(has_tracks, -y, 0.0), torch.where(has_tracks, x, 0.0)), -1)
@@ -148,7 +148,7 @@ def rotation_from_flow(seen: Sightings, ray_0: Tensor) -> Pose:
 def scene_flow(
     T: Pose, cov: Tensor, xyz: Tensor, known: Tensor, camera: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Median length (B,) px of the motion of points (B, 3, N) in the picture, and its standard deviation.
+    """Median length (B,) px of the motion of points (B, 3, N) in the image, and its standard deviation.
 
     ``camera``: focal lengths and principal points, (B, 2) px; ``known`` (B, N): the points that count.
     """

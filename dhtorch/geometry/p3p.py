@@ -110,7 +110,7 @@ def p3p_of_planes(
 
 def _ranges(m: Tensor, a: Tensor) -> Tensor:
     """Ranges (3, 4, *) of the four intersections of the two cones, scaled to satisfy the sum of the three equations."""
-    cones = _cones(m, a)
+    cones = _degenerate_conics(m, a)
     gamma = _outer_root(cones)
     first, second = (cones * (gamma * gamma + 1).rsqrt()).unbind(2)
     split, other = gamma * first + second, first - gamma * second  # det(split) = 0
@@ -127,7 +127,7 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     return d * (0.5 * a.sum(0) / size).sqrt().copysign(d.sum(0))
 
 
-def _cones(m: Tensor, a: Tensor) -> Tensor:
+def _degenerate_conics(m: Tensor, a: Tensor) -> Tensor:
     """Symmetric matrices (3, 3, 2, *) of a_1 × (equation 0) − a_0 × (equation 1), and of the same with 2 for 0."""
     p = a[::2]
     yz = (p * m[1]).unbind(0)

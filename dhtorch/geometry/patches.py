@@ -133,7 +133,7 @@ def _read_patches(flat: Tensor, channels: tuple[int, int], offsets: Tensor, cent
 
 
 def _read_interleaved_patches(flat: Tensor, grey: bool, offsets: Tensor, centre: Tensor) -> Tensor:
-    """Pixels (3, size, size, P) of patches of an interleaved uint8 picture, or their ``grey`` values.
+    """Pixels (3, size, size, P) of patches of an interleaved uint8 image, or their ``grey`` values.
 
     Rows of pixels are read as blocks of memory. Grey values are one matrix product, whose sums of integers below 2²⁴
     are exact in any order.
@@ -177,7 +177,7 @@ def is_patch_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
 
 
 def is_inside_picture(uv: Tensor, picture: Tensor) -> Tensor:
-    """Whether points (B, N, 2) px lie in a picture (…, H, W), (B, N): its outer pixels belong to it entirely."""
+    """Whether points (B, N, 2) px lie in an image (…, H, W), (B, N): its outer pixels belong to it entirely."""
     H, W = picture.shape[-2:]
     return ((uv >= -0.5) & (uv <= constant(uv, [W, H]) - 0.5)).all(-1)
 
@@ -243,9 +243,9 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
     """Pixels with channels along ``dim`` (1 or 3, float in [0, 1] or uint8) -> grey values in [0, 1], BT.601.
 
     The channel dimension is kept with size 1. Floating images keep their dtype, uint8 becomes float32. For patches;
-    whole pictures use :func:`dhtorch.geometry.filters.grayscale`, by kornia.
+    whole images use :func:`dhtorch.geometry.filters.grayscale`, by kornia.
     """
-    # Divided first, so that a picture in bytes and the same picture in floats have equal grey values, bit for bit.
+    # Divided first, so that an image in bytes and the same image in floats have equal grey values, bit for bit.
     rgb = rgb.float().div_(255) if rgb.dtype == torch.uint8 else rgb
     if rgb.shape[dim] == 1:
         return rgb

@@ -8,7 +8,7 @@ refined by grey values.
 
 The source view is resampled once, into the orientation of the reference view (*rectified*): a plane then moves pixels
 only along their epipolar lines, windows are not rotated against each other, and codes are computed once and looked up.
-The resampling includes lens distortion and the rotation of a rolling shutter; no picture is undistorted first.
+The resampling includes lens distortion and the rotation of a rolling shutter; no image is undistorted first.
 
 All costs are integers: they depend on no order of summation, so not on batch, threads, tiles or device.
 """
@@ -54,7 +54,7 @@ MAX_SWEPT_VIEWS = 8
 #: Rows whose best planes are computed at once.
 ROWS_PER_BLOCK = 32
 
-#: Margin around the reference picture in which the source view is sampled: its longer side over this number.
+#: Margin around the reference image in which the source view is sampled: its longer side over this number.
 BORDER_DIVISOR = 4
 
 #: Lower limit of the variance, in a window, of the grey value's derivative by inverse depth, m².
@@ -69,7 +69,7 @@ FLAT_VARIANCE = 1e-8
 #: Depth in the source view over depth in the reference view up to which a point is behind the source view.
 MIN_DEPTH_RATIO = 1e-3
 
-#: Factor on the pixel of a point behind the source view, which moves it outside any picture.
+#: Factor on the pixel of a point behind the source view, which moves it outside any image.
 BEHIND_SCALE = 1e9
 
 
@@ -86,7 +86,7 @@ class ReferenceView(Record):
 
     @property
     def hw(self) -> tuple[int, int]:
-        """Height and width of the picture."""
+        """Height and width of the image."""
         return self.image.shape[-2], self.image.shape[-1]
 
 
@@ -101,7 +101,7 @@ class SweptView(Record):
 
 
 class EpipolarWarp(NamedTuple):
-    """Inverse depth q of a reference pixel -> pixel of the rectified picture, (a + q b) / (1 + q c), px of view 0."""
+    """Inverse depth q of a reference pixel -> pixel of the rectified image, (a + q b) / (1 + q c), px of view 0."""
 
     a: Tensor  # (B, 2, N)
     b: Tensor  # (B, 2, 1)
@@ -115,7 +115,7 @@ class EpipolarWarp(NamedTuple):
         return u, v
 
     def cell(self, q: Tensor, hw: tuple[int, int], margin: int) -> Tensor:
-        """Inverse depths -> flat index (B, N) of the nearest pixel of a picture of size ``hw`` in which view 0 begins
+        """Inverse depths -> flat index (B, N) of the nearest pixel of an image of size ``hw`` in which view 0 begins
         ``margin`` px from the border; of a border pixel for points outside."""
         column, row = (
             x.add_(margin + 0.5)
@@ -127,7 +127,7 @@ class EpipolarWarp(NamedTuple):
 
 
 def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
-    """Camera and picture size -> rays (B, N, 3), z = 1, of its pixels and ``margin`` px around; NaN outside the lens.
+    """Camera and image size -> rays (B, N, 3), z = 1, of its pixels and ``margin`` px around; NaN outside the lens.
 
     In memory each axis is a contiguous plane, as are all per-pixel numbers of this module: operations then run along
     pixels.
@@ -144,7 +144,7 @@ def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
 
 
 def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
-    """Grey picture (B, 1, h, w) and camera -> reference view. Gradient: to the picture and, through the rays, to the
+    """Grey image (B, 1, h, w) and camera -> reference view. Gradient: to the image and, through the rays, to the
     camera."""
     check("make_reference_view", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
@@ -226,7 +226,7 @@ def _sample_bilinear_kernel(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 @operator(kernel=_sample_bilinear_kernel, dtypes={"image": torch.float32, "uv": torch.float32}, any_layout=("uv",))
 def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Pictures (B, C, H, W) and pixels (B, N, 2) -> bilinear values (B, C, N), and which pixels lie inside (B, N).
+    """Images (B, C, H, W) and pixels (B, N, 2) -> bilinear values (B, C, N), and which pixels lie inside (B, N).
 
     Gradient: to both."""
     H, W = image.shape[-2:]
@@ -238,7 +238,7 @@ def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
-    """Reference and source view -> path of every reference pixel in the rectified picture. Gradient: to cameras and
+    """Reference and source view -> path of every reference pixel in the rectified image. Gradient: to cameras and
     motion."""
     s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None]).mT
     f, c = base.camera.f[..., None], base.camera.c[..., None]
@@ -254,7 +254,7 @@ def _census_kernel(grey: Tensor) -> Tensor:
 
 @operator(kernel=_census_kernel, dtypes={"grey": torch.float32})
 def census_transform(grey: Tensor) -> Tensor:
-    """Pictures (B, 1, h, w) -> codes (B, h, w) int32: of each of 31 neighbours whether it is darker than the middle."""
+    """Images (B, 1, h, w) -> codes (B, h, w) int32: of each of 31 neighbours whether it is darker than the middle."""
     check("census_transform", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
@@ -289,7 +289,7 @@ def add_census_costs(
     """Add the matching costs of every pixel and plane in a source view to C; ``fresh``: C is overwritten.
 
     At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C comes from :func:`new_cost_volume`, or has its planes first
-    in memory. Memory: pictures of view 0's size, whatever D. Gradient: none.
+    in memory. Memory: images of view 0's size, whatever D. Gradient: none.
     """
     margin = max(base.hw) // BORDER_DIVISOR
     hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
@@ -339,7 +339,7 @@ def _new_cost_volume_kernel(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
 
 @operator(kernel=_new_cost_volume_kernel, dtypes={"q": torch.float32})
 def new_cost_volume(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
-    """Planes q (B, D) and picture size -> uninitialised costs (B, D, h, w) uint8, in the memory layout that
+    """Planes q (B, D) and image size -> uninitialised costs (B, D, h, w) uint8, in the memory layout that
     :func:`add_census_costs` fills fastest. Gradient: none."""
     return torch.empty(*q.shape, *hw, dtype=torch.uint8, device=q.device)
 
@@ -508,7 +508,7 @@ class WindowFit(NamedTuple):
 
 
 def stack_gradients(grey: Tensor) -> Tensor:
-    """Grey pictures (B, 1, H, W) -> (B, 3, H, W): grey and its central differences along u and v."""
+    """Grey images (B, 1, H, W) -> (B, 3, H, W): grey and its central differences along u and v."""
     padded = F.pad(grey, (1, 1, 1, 1), mode="replicate")
     du, dv = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     return torch.cat([grey, 0.5 * du, 0.5 * dv], 1)
@@ -594,7 +594,7 @@ def occlusion_mask(go: EpipolarWarp, q: Tensor, tolerance: Tensor) -> Tensor:
 
 
 def _padded_size(hw: tuple[int, int]) -> tuple[tuple[int, int], int]:
-    """Picture size -> height and width with a border for points outside the picture; width of the border, px."""
+    """Image size -> height and width with a border for points outside the image; width of the border, px."""
     border = max(hw) // BORDER_DIVISOR
     return (hw[0] + 2 * border, hw[1] + 2 * border), border
 

@@ -5,7 +5,7 @@ the aperture, ``c`` diameter of the spot (px). The spot grows with the distance 
 
     c = gain · (1/s − 1/z),   gain = A f s / ((s − f) · pixel pitch)
 
-so c is positive beyond the focus and negative in front of it. A picture determines |c| alone.
+so c is positive beyond the focus and negative in front of it. An image determines |c| alone.
 """
 
 from __future__ import annotations

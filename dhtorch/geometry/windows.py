@@ -18,7 +18,7 @@ MAX_BAND_PIXELS = 1 << 17
 
 
 def row_bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
-    """Picture (B, ...) and map size -> slices of rows to process at once; a single one under a gradient or a compiler,
+    """Image (B, ...) and map size -> slices of rows to process at once; a single one under a gradient or a compiler,
     where each would add to the graph."""
     h, w = hw
     whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())

@@ -45,7 +45,7 @@ def scene(batch=(), n=12, noise_px=0.0):
 
 
 def pictures(batch=1, dtype=torch.float64, shift=(3.0, -2.0), hw=(96, 128)):
-    """A smooth picture and the same moved by ``shift`` px, (batch, 1, H, W) each."""
+    """A smooth image and the same moved by ``shift`` px, (batch, 1, H, W) each."""
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in hw), indexing="ij")
 
     def at(u, v):
@@ -56,7 +56,7 @@ def pictures(batch=1, dtype=torch.float64, shift=(3.0, -2.0), hw=(96, 128)):
 
 
 def places(batch=1, n=6, dtype=torch.float64):
-    """Pixels of such a picture away from its border."""
+    """Pixels of such an image away from its border."""
     return (uniform(batch, n, 2, seed=4) * torch.tensor([80.0, 48.0]) + 24).to(dtype)
 
 

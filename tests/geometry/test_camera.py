@@ -36,7 +36,7 @@ def pinhole(lens=None, batch=1):
 
 
 def grid(batch=1, margin=20.0):
-    """Pixels (B, 35, 2) over the whole picture, corners included."""
+    """Pixels (B, 35, 2) over the whole image, corners included."""
     v, u = torch.meshgrid(
         torch.linspace(margin, HW[0] - margin, 5, dtype=torch.float64),
         torch.linspace(margin, HW[1] - margin, 7, dtype=torch.float64),

@@ -1,4 +1,4 @@
-"""Where to look first: coarse motion of whole pictures, against motions that are known."""
+"""Where to look first: coarse motion of whole images, against motions that are known."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _texture(seed: int) -> Tensor:
 def _pair(
     seed: int, shift: tuple[float, float], turn_deg: float = 0.0, zoom: float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Two pictures of one texture, and where (H, W, 2) each pixel of the first lies in the second."""
+    """Two images of one texture, and where (H, W, 2) each pixel of the first lies in the second."""
     world = _texture(seed)
     a = math.radians(turn_deg)
     A = zoom * torch.tensor([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
@@ -224,7 +224,7 @@ def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
 
 
 def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
-    """Noise turns and grows with the picture, what was found beyond the image is not in it, and a start is undone."""
+    """Noise turns and grows with the image, what was found beyond the image is not in it, and a start is undone."""
     turn = 1.3 * torch.tensor([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
     linear = torch.stack([turn, torch.eye(2)])
     middle = torch.tensor([[[W / 2, H / 2]]]).expand(2, 1, 2)

@@ -1,4 +1,4 @@
-"""Filters of whole pictures, against SciPy's with the border's pixels repeated."""
+"""Filters of whole images, against SciPy's with the border's pixels repeated."""
 
 import math
 

@@ -125,7 +125,7 @@ def test_a_pose_that_is_not_determined_has_no_covariance():
 
 
 def normalised_square(shared_px, blocks, n=60):
-    """Mean squared error of n poses in standard deviations, per parameter; tracks of a twelfth of the picture share an
+    """Mean squared error of n poses in standard deviations, per parameter; tracks of a twelfth of the image share an
     error of ``shared_px``."""
     args, T, *_ = map_pose_inputs(n, 160, 0, noise=0.3, depth=0.002, baseline=0.3, seed=5)
     samples, tracks = args[:2]

@@ -16,7 +16,7 @@ def generator(seed=0):
 
 
 def texture(h, w, sigma=1.5, seed=0, dtype=torch.float32):
-    """A picture of blobs with grey values in [0, 1]."""
+    """An image of blobs with grey values in [0, 1]."""
     image = gaussian_blur(torch.rand(1, 1, h, w, generator=generator(seed), dtype=torch.float64), sigma)
     return ((image - image.min()) / (image.max() - image.min())).to(dtype)
 
@@ -24,7 +24,7 @@ def texture(h, w, sigma=1.5, seed=0, dtype=torch.float32):
 def wall(depth, t, *, angle=(0.0, 0.0, 0.0), hw=(96, 128), slope=0.0, dtype=torch.float32):
     """View 0, view 1 of a wall at that depth (of the ray straight ahead; it recedes by ``slope`` along x), and truth.
 
-    The wall bears the picture of view 0; view 1 is what that shows from elsewhere.
+    The wall bears the image of view 0; view 1 is what that shows from elsewhere.
     """
     h, w = hw
     camera = Camera(
@@ -184,7 +184,7 @@ def test_what_the_step_says_of_the_pictures_is_the_derivative_of_the_depth_that_
     moved = view.replace(T_1_from_0=view.T_1_from_0.replace(t=t))
     step = plane_sweep.fit_windows(base, moved, picture, truth).step[0, 48, 64]
     (g,) = torch.autograd.grad(step, t)
-    # q · |t| is what the pictures show: d q / d t_x = - q / t_x at the depth that fits
+    # q · |t| is what the images show: d q / d t_x = - q / t_x at the depth that fits
     assert float(g[0, 0]) == pytest.approx(-0.5 / 0.2, rel=0.1)
 
 
