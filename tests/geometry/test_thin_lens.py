@@ -1,4 +1,4 @@
-"""The thin lens, against the lens equation and similar triangles in plain numbers."""
+"""The thin lens, against the lens equation and similar triangles."""
 
 import math
 
@@ -8,60 +8,46 @@ import torch
 
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, depth_of_spot, spot_diameter, spot_gain
 
-F, STOP, PITCH, FOCUS = (0.05, 0.035), (2.0, 5.6), (5e-6, 2e-6), (2.0, 0.8)
+
+def double(*values):
+    return torch.tensor(values, dtype=torch.float64)
 
 
-def lens():
-    return Lens(*(torch.tensor(x, dtype=torch.float64) for x in (F, STOP, PITCH)))
+F, STOP, PITCH, FOCUS = double(0.05, 0.035), double(2.0, 5.6), double(5e-6, 2e-6), double(2.0, 0.8)
+LENS = Lens(F, STOP, PITCH)
 
 
-def spot_px(b, z, focus):
+def spot_px(z, focus):
     """Images form at v(z), the sensor stands at v(focus); the cone of light behind the aperture is cut there."""
-    v = {x: 1 / (1 / F[b] - 1 / x) for x in (z, focus)}
-    return F[b] / STOP[b] * (v[focus] - v[z]) / v[z] / PITCH[b]
+    at_z, at_focus = (1 / (1 / F[:, None] - 1 / x) for x in (z, focus))
+    return (F / STOP / PITCH)[:, None] * (at_focus - at_z) / at_z
 
 
-def test_the_spot_is_the_cut_through_the_cone_of_light():
-    depth = torch.tensor([[0.3, 1.0, 2.0, 4.0, 300.0], [0.2, 0.8, 0.9, 2.0, 50.0]], dtype=torch.float64)
-    spot = spot_diameter(lens(), depth, torch.tensor(FOCUS, dtype=torch.float64))
-    want = [[spot_px(b, float(z), FOCUS[b]) for z in depth[b]] for b in range(2)]
-    np.testing.assert_allclose(spot.numpy(), want, rtol=1e-9, atol=1e-9)
-    assert spot[0, 0] < 0 < spot[0, 3], "positive beyond the focus"
+def test_the_spot_is_the_cut_through_the_cone_of_light_and_tells_the_depth():
+    depth = double([0.3, 1.0, 2.0, 4.0, 300.0], [0.2, 0.8, 0.9, 2.0, 50.0])
+    want = spot_px(depth, FOCUS[:, None])
+    torch.testing.assert_close(spot_diameter(LENS, depth, FOCUS), want, rtol=1e-9, atol=1e-9)
+    assert want[0, 0] < 0 < want[0, 3], "positive beyond the focus"
+    torch.testing.assert_close(depth_of_spot(LENS, want, FOCUS), depth, rtol=1e-9, atol=0)
+    assert (
+        spot_diameter(LENS, double([0.0, -1.0, 1.0]).expand(2, 3), FOCUS).isnan().tolist() == [[True, True, False]] * 2
+    )
 
 
 def test_the_gain_is_pixels_of_spot_per_dioptre_out_of_focus():
-    focus = torch.tensor([[0.5, 2.0, 7.0], [0.1, 0.8, 1e3]], dtype=torch.float64)
-    gain = spot_gain(lens(), focus)
-    for b in range(2):
-        for k, s in enumerate(focus[b].tolist()):
-            # A quarter of a dioptre nearer and farther, in front of the same sensor.
-            near, far = (spot_px(b, 1 / (1 / s + d), s) for d in (0.25, -0.0005))
-            assert float(gain[b, k]) == pytest.approx((far - near) / 0.2505, rel=1e-6)
-
-
-def test_a_focus_at_the_focal_length_or_nearer_is_kept_a_nanometre_beyond_it():
-    gain = spot_gain(lens(), torch.tensor([[0.05, 0.01], [0.035, 0.0351]], dtype=torch.float64))
-    want = F[0] ** 2 / STOP[0] / (1e-9 * PITCH[0])
-    np.testing.assert_allclose(gain[0].numpy(), [0.05 * want, 0.01 * want], rtol=1e-6)
-
-
-def test_depth_and_spot_are_inverse_to_each_other():
-    focus = torch.tensor(FOCUS, dtype=torch.float64)
-    depth = torch.tensor([[0.3, 1.0, 2.0, 40.0], [0.2, 0.8, 0.9, 3.0]], dtype=torch.float64)
-    spot = torch.tensor(
-        [[spot_px(b, float(z), FOCUS[b]) for z in depth[b]] for b in range(2)], dtype=torch.float64, requires_grad=True
-    )
-    found = depth_of_spot(lens(), spot, focus)
-    torch.testing.assert_close(found, depth, rtol=1e-9, atol=0)
+    focus = double([0.5, 2.0, 7.0], [0.1, 0.8, 1e3])
+    # A quarter of a dioptre nearer, and a little farther, in front of the same sensor.
+    near, far = (spot_px(1 / (1 / focus + d), focus) for d in (0.25, -0.0005))
+    torch.testing.assert_close(spot_gain(LENS, focus), (far - near) / 0.2505, rtol=1e-6, atol=0)
+    gain = spot_gain(LENS, double([0.05, 0.01], [0.035, 0.0351]))  # a focus is kept a nanometre beyond the focal length
+    torch.testing.assert_close(gain[0], double(0.05, 0.01) * F[0] ** 2 / STOP[0] / (1e-9 * PITCH[0]), rtol=1e-6, atol=0)
 
 
 def test_no_spot_beyond_the_focus_is_larger_than_infinitys():
-    focus = torch.tensor(FOCUS, dtype=torch.float64)
-    infinity = torch.tensor([[spot_px(b, 1e15, FOCUS[b])] for b in range(2)], dtype=torch.float64)
-    found = depth_of_spot(lens(), infinity * torch.tensor([0.999, 1.001, 1e3, -1e3], dtype=torch.float64), focus)
+    infinity = spot_px(torch.full((2, 1), 1e15, dtype=torch.float64), FOCUS[:, None])
+    found = depth_of_spot(LENS, infinity * double(0.999, 1.001, 1e3, -1e3), FOCUS)
     assert found.isnan().tolist() == [[False, True, True, False]] * 2
-    for b in range(2):
-        assert float(found[b, 0]) == pytest.approx(1000 * FOCUS[b], rel=1e-6)
+    torch.testing.assert_close(found[:, 0], 1000 * FOCUS, rtol=1e-6, atol=0)
     exact = Lens(*(torch.ones(1) for _ in range(3)))  # f = N = pitch = 1: at s = 2 the gain is 2, infinity's spot 1
     assert depth_of_spot(exact, torch.tensor([[1.0]]), torch.tensor([2.0])).isnan().all()
 

@@ -881,15 +881,3 @@ def test_answers_agree_to_far_less_than_their_sigma(loaded, monkeypatch, name):
     assert both.float().mean() > 0.1
     assert ((found.depth - expected.depth)[both].abs() / expected.sigma[both]).quantile(0.99) <= 0.1
     torch.testing.assert_close(found.sigma[both].median(), expected.sigma[both].median(), rtol=1e-3, atol=0.0)
-
-
-def test_a_registration_keeps_its_gradient(loaded, monkeypatch):
-    here, there, uv = (x[1:] for x in seen_twice())
-    seen = there.clone().requires_grad_()
-
-    def slope():
-        tracks = lucas_kanade_affine(here, seen, uv, hint=TrackHint(start=uv + torch.tensor([5.0, -3.0])))
-        return torch.autograd.grad(tracks.uv_1[tracks.valid & (tracks.error < 0.5)].sum(), seen)[0]
-
-    found, expected = slope(), without_kernels(slope, monkeypatch)
-    assert expected.abs().max() > 0 and (found - expected).norm() < 0.02 * expected.norm()
