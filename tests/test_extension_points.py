@@ -151,7 +151,7 @@ assert "data/readers/stacked.py" in find_reachable_modules(["dhtorch.data.open_c
 def test_a_column_is_an_entry_and_its_function(fork):
     schema = "dhtorch/transforms/schema.py"
     function = "def _trackability(found: SampleResults) -> Tensor:\n    return found.samples.trackability\n\n\n"
-    fork.insert(schema, "def _problem(results", function)
+    fork.insert(schema, "def _xyz(results", function)
     entry = (
         '    ColumnSpec("trackability", _N, _F, "1", "texture there", _trackability, half=True, enrich="numbers"),\n'
     )

@@ -114,8 +114,7 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     upright = torch.asin((subset @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
     # A surface leans by 5°; twice the score of surfaces with random normals is enough.
-    near_upright, near_level = (torch.exp(-0.5 * (angle / 0.087) ** 2) for angle in (upright, level))
-    score = (near_upright + near_level).mean(0)
+    score = (torch.exp(-0.5 * (upright / 0.087) ** 2) + torch.exp(-0.5 * (level / 0.087) ** 2)).mean(0)
     best = int(score.argmax())
     return axes[best] if float(score[best]) >= 0.25 else None
 

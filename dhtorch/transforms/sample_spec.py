@@ -26,7 +26,13 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.inputs import EXPECTED_METRES, EXPECTED_RANGE, dtype_name
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Frame, PosePrior
-from dhtorch.transforms import poses
+from dhtorch.transforms.poses import (
+    POSE_KINDS,
+    PoseMatrix,
+    check_constant_pose,
+    parse_pose_sigmas,
+    read_pose_priors,
+)
 from dhtorch.transforms.sample_access import KeyOrCamera, KeyOrNumbers, SampleError, SampleReader
 
 #: Named depth units -> units per metre.
@@ -94,7 +100,7 @@ class SampleSpec:
     at: int = -1  # index of the reference view along time
     other_at: int | Sequence[int] = 0  # index of the source view; several are for a multi-view method
     # Key of an external pose, 4x4 or 3x4, NaN = unknown; or, with "1_from_0", the matrix itself: two cameras of a rig.
-    pose: str | poses.PoseMatrix | None = None
+    pose: str | PoseMatrix | None = None
     # "world_from_cam": of each frame; "1_from_0": maps points of the reference view into the source view.
     pose_kind: str = "world_from_cam"
     # Of each such pose: key of 6x6 (left perturbation, rad and m); or two standard deviations (rad, m) of the relative
@@ -253,7 +259,7 @@ class SampleSpec:
         offsets = [self.other_at] if isinstance(self.other_at, int) else self.other_at
         indices = [_frame_index(p, T_other, self.other_image or self.image) for p in offsets]
         unit = self.pose_unit
-        priors = poses.read_pose_priors(
+        priors = read_pose_priors(
             leaves,
             (_frame_index(self.at, T, self.image), indices),
             (T, T_other),
@@ -274,8 +280,8 @@ class SampleSpec:
             options = {"pose_cov": self.pose_cov, "other_pose": self.other_pose, "refine": self.refine or None}
             if pose_only := [name for name, value in options.items() if value is not None]:
                 raise ValueError(f"found {pose_only[0]} without pose, expected the key of a pose")
-        if self.pose_kind not in poses.POSE_KINDS:
-            raise ValueError(f"pose_kind is {self.pose_kind!r}, expected {' or '.join(poses.POSE_KINDS)}")
+        if self.pose_kind not in POSE_KINDS:
+            raise ValueError(f"pose_kind is {self.pose_kind!r}, expected {' or '.join(POSE_KINDS)}")
         if self.pose_axes not in conventions.STATED_AXES:
             raise ValueError(f"pose_axes is {self.pose_axes!r}, expected {' or '.join(conventions.STATED_AXES)}")
         if not (unit in SAMPLE_UNITS_PER_METRE or (isinstance(unit, float | int) and 0 < unit < float("inf"))):
@@ -283,11 +289,11 @@ class SampleSpec:
                 f"pose_unit is {unit!r}, expected one of {sorted(SAMPLE_UNITS_PER_METRE)} or metres per unit"
             )
         if not isinstance(self.pose, str | None):
-            poses.check_constant_pose(self.pose, self.pose_kind)
+            check_constant_pose(self.pose, self.pose_kind)
         between_two = self.other_image is not None and self.pose_kind == "world_from_cam"
         if self.pose is not None and between_two and self.other_pose is None:
             raise ValueError("found pose and other_image, expected other_pose: the other view's pose")
-        poses.parse_pose_sigmas(self.pose_cov)
+        parse_pose_sigmas(self.pose_cov)
 
     def _scaled(self, x: Tensor) -> Tensor:
         """Depths in the data set's unit -> metres, 0 for those that mean no return."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -26,8 +27,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.runtime.console import format_count
 from dhtorch.validation import faults
-from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
-from dhtorch.validation.edge_lag import find_edge_lag
+from dhtorch.validation.edges import do_edges_refute, find_edge_fault, find_edge_lag
 from dhtorch.validation.faults import Diagnosis, KnownFault, WindowTracks
 from dhtorch.validation.options import ValidationOptions
 from dhtorch.validation.picture_field import PictureField, measure_picture_field
@@ -50,30 +50,12 @@ _TURN_OPTIONS: Final = {
 #: Source: derived, the losses of dhtorch.validation.faults.
 _MAX_TRACKED_PX: Final = 640
 
-#: Options of the diagnosis: five pairs instead of eight. Limits the time. Source: origin not recorded.
+#: Options of the diagnosis: five pairs instead of eight limit the time.
 _OPTIONS: Final = ValidationOptions(max_window_pairs=5)
 
 #: Mean loss of tracks under the motions of near returns up to which the latter explain them.
 #: Source: chosen on the sound captures of the shared data: 0.11 to 0.23 where motion is moderate.
 MAX_EXPLAINED_LOSS: Final = 0.3
-
-#: Pictures instead of depth have a fault if undoing it in the depth raises the disagreement of surfaces under the poses
-#: by this ratio. Source: origin not recorded.
-_MIN_WORSE_RATIO: Final = 1.5
-
-#: Least difference of that disagreement. Source: origin not recorded.
-_MIN_WORSE_DISAGREEMENT: Final = 0.003
-
-#: Epipolar distances at which pictures are said to follow one of two sets of poses: the smaller median is at most this
-#: fraction of the larger one. Source: origin not recorded.
-_MAX_EPIPOLAR_RATIO: Final = 0.7
-
-#: Error of the scale of depth and poses above which it is stated that a smaller one is not noticed.
-#: Source: derived, twice the least factor that is reported.
-_NOTEWORTHY_SCALE_ERROR: Final = 0.09
-
-#: Kinds of a known fault that pictures of another field of view may look like.
-_FIELD_KINDS: Final = ("registration", "focal length", "along the ray")
 
 
 @dataclass(frozen=True)
@@ -107,7 +89,7 @@ class CaptureCheck:
     def limits(self) -> list[str]:
         """What the window cannot show, each a sentence."""
         error = None if self.poses is None or self.findings else self.poses.scale_error
-        if error is None or error <= _NOTEWORTHY_SCALE_ERROR:
+        if error is None or error <= 0.09:  # twice the least factor that is reported
             return []
         size = "of a third or less" if math.isinf(error) else f"up to {error:.0%}"
         return [f"the scale of depth and poses is not checked exactly: an error {size} would not show in this motion"]
@@ -149,15 +131,24 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     views = {i: _reduced(frame.replace(T_world_from_cam=None)) for i, frame in window.items() if 0 not in frame.hw}
     tracks, diagnosis = _diagnose_window(list(views.values()), seed)
     positions = list(views)
-    pairs = [(positions[i], positions[j]) for i, j in tracks.pairs] or _neighbouring_pairs(list(window))
+    pairs = [(positions[i], positions[j]) for i, j in tracks.pairs] or list(itertools.pairwise(list(window)))[:8]
     tracked = list(zip(tracks.samples, tracks.tracks, strict=True))
     poses = None if recording.poses is None else check_poses(recording.poses, {**window, **views}, pairs, tracked)
-    fault = _fault_of(diagnosis)
+    cause = None if diagnosis is None else diagnosis.cause
+    fault = next((each for each in faults.KNOWN_FAULTS if each.name == cause), None)
     if fault is None or do_edges_refute(list(views.values()), fault):
         fault = _edge_fault(list(views.values()), diagnosis)
     field = _field_of_pictures(recording, poses, fault, views, list(zip(pairs, tracked, strict=False)))
     if field is not None:
-        findings.append(_field_finding(field, next(iter(views.values()))))
+        view = next(iter(views.values()))
+        camera = field.camera(view.camera, view.hw)
+        K = ", ".join(f"{x:.0f}" for x in (*camera.f[0].tolist(), *camera.c[0].tolist()))
+        text = (
+            f"depth does not lie over its pictures: these show {1 / field.zoom:.2f} of the field of view that K "
+            "states, while depth and poses agree: they are cropped or resized alone, "
+            f"and their own K is about fx, fy, cx, cy = {K} px at {view.hw[1]}x{view.hw[0]}"
+        )
+        findings.append(Finding("registration", text))
     else:
         findings += _combined_findings(recording, poses, fault, {**window, **views}, pairs, tracks)
     check = CaptureCheck(recording, assumed, tuple(findings), poses, diagnosis)
@@ -166,14 +157,11 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
 
 def _read_window(recording: Recording, known: Mapping[int, Frame]) -> dict[int, Frame]:
     """Up to :data:`WINDOW_FRAMES` consecutive readable frames where the camera moves most, by position."""
-    n = len(recording)
     first = _first_of_window(recording)
     window: dict[int, Frame] = {}
-    for i in range(first, min(first + WINDOW_FRAMES, n)):
-        try:
+    for i in range(first, min(first + WINDOW_FRAMES, len(recording))):
+        with suppress(FormatError):
             window[i] = known[i] if i in known else recording[i]
-        except FormatError:
-            continue
     return window
 
 
@@ -189,11 +177,6 @@ def _first_of_window(recording: Recording) -> int:
     total = torch.cat((torch.zeros(1, dtype=step.dtype), step.cumsum(0)))
     length = total[WINDOW_FRAMES - 1 :] - total[: len(total) - WINDOW_FRAMES + 1]
     return int(length[: last + 1].argmax())
-
-
-def _neighbouring_pairs(positions: Sequence[int]) -> list[tuple[int, int]]:
-    """Pairs of neighbouring frames, where pictures give no tracks."""
-    return list(itertools.pairwise(positions))[:8]
 
 
 def _diagnose_window(frames: Sequence[Frame], seed: int) -> tuple[WindowTracks, Diagnosis | None]:
@@ -216,13 +199,6 @@ def _reduced(frame: Frame) -> Frame:
     hw = round(h * scale), round(w * scale)
     image = F.interpolate(frame.image.float(), hw, mode="area").round().to(frame.image.dtype)
     return frame.replace(image=image, camera=cam.resize(frame.camera, frame.hw, hw))
-
-
-def _fault_of(diagnosis: Diagnosis | None) -> KnownFault | None:
-    """The fault of a diagnosis; None without one."""
-    if diagnosis is None or diagnosis.cause is None:
-        return None
-    return next(each for each in faults.KNOWN_FAULTS if each.name == diagnosis.cause)
 
 
 def _intrinsics_findings(frames: Sequence[Frame]) -> list[Finding]:
@@ -268,7 +244,7 @@ def _field_of_pictures(
 
     Poses and depth must agree, and no fault of another kind may explain the tracks.
     """
-    is_other = fault is not None and fault.kind not in _FIELD_KINDS
+    is_other = fault is not None and fault.kind not in ("registration", "focal length", "along the ray")
     if poses is None or poses.surfaces_contradict or is_other or not tracked:
         return None
     pairs, tracks = zip(*tracked, strict=True)
@@ -293,13 +269,25 @@ def _combined_findings(
     """Findings from the two checks: the fault of depth beside its pictures, and the poses beside the depth."""
     mended = None
     if poses is not None and fault is not None:
-        mended = check_poses(_poses_of(recording), _undo(fault, window), _inside(fault, pairs, window))
+        undone = {
+            i: frame.replace(depth=faults.undo_fault(window[i + fault.lag].depth, fault, frame))
+            for i, frame in window.items()
+            if i + fault.lag in window
+        }
+        mended = check_poses(_poses_of(recording), undone, [(i, j) for i, j in pairs if i in undone and j in undone])
     if poses is None or not poses.contradicts:
-        findings = [] if fault is None else [_fault_finding(fault, pictures=_are_pictures_wrong(poses, mended))]
+        # Pictures instead of depth have the fault if undoing it in the depth makes surfaces disagree more.
+        stated, other = (math.nan if each is None else each.surfaces.stated for each in (poses, mended))
+        is_of_pictures = other > 1.5 * stated and other - stated > 0.003
+        findings = [] if fault is None else [_fault_finding(fault, pictures=is_of_pictures)]
         if poses is not None and poses.factor != 1:
             findings.append(Finding("scale", describe_factor(poses)))
         if poses is not None and poses.is_depth_noise:
-            findings.append(Finding("plausibility", _noise_text(poses)))
+            best = 100 * min(poses.surfaces.best_score, poses.surfaces.without)
+            text = (
+                f"depths of two frames disagree by {best:.0f} % at best: these are no distances (encoding, byte order)"
+            )
+            findings.append(Finding("plausibility", text))
         return findings
     if fault is not None and mended is not None and not mended.contradicts:
         return [_fault_finding(fault)]
@@ -309,28 +297,6 @@ def _combined_findings(
         return [Finding("time offset", _lag_text(-lag, "pictures and poses"), f"data.depth_lag={-lag}")]
     findings = [Finding("poses", f"{text}; they are not used", remedy)]
     return findings if fault is None or lag else [*findings, _fault_finding(fault)]
-
-
-def _field_finding(field: PictureField, view: Frame) -> Finding:
-    """Sentence for pictures of another field of view than K states."""
-    camera = field.camera(view.camera, view.hw)
-    K = ", ".join(f"{x:.0f}" for x in (*camera.f[0].tolist(), *camera.c[0].tolist()))
-    text = (
-        f"depth does not lie over its pictures: these show {1 / field.zoom:.2f} of the field of view that K states, "
-        f"while depth and poses agree: they are cropped or resized alone, "
-        f"and their own K is about fx, fy, cx, cy = {K} px at {view.hw[1]}x{view.hw[0]}"
-    )
-    return Finding("registration", text)
-
-
-def _are_pictures_wrong(poses: PoseCheck | None, mended: PoseCheck | None) -> bool:
-    """Whether surfaces coincide under the poses clearly worse once a fault of the depth is undone."""
-    return (
-        poses is not None
-        and mended is not None
-        and mended.surfaces.stated > _MIN_WORSE_RATIO * poses.surfaces.stated
-        and mended.surfaces.stated - poses.surfaces.stated > _MIN_WORSE_DISAGREEMENT
-    )
 
 
 def _poses_of(recording: Recording) -> Pose:
@@ -355,32 +321,9 @@ def _fault_finding(fault: KnownFault, *, pictures: bool = False) -> Finding:
     return Finding(fault.kind, f"depth is wrong: {fault.name}")
 
 
-def _noise_text(poses: PoseCheck) -> str:
-    """Sentence for depth that disagrees with itself under every reading of the poses."""
-    scores = poses.surfaces
-    best = 100 * min(scores.best_score, scores.without)
-    return f"depths of two frames disagree by {best:.0f} % at best: these are no distances (encoding, byte order)"
-
-
 def _lag_text(lag: int, against: str = "the pictures", subject: str = "depth is") -> str:
     late = "late" if lag > 0 else "early"
     return f"{subject} {format_count(abs(lag), 'frame')} {late} against {against}"
-
-
-def _undo(fault: KnownFault, window: Mapping[int, Frame]) -> dict[int, Frame]:
-    """Frames of a window with a fault of their depth undone."""
-    undone: dict[int, Frame] = {}
-    for i, frame in window.items():
-        source = window.get(i + fault.lag)
-        if source is not None:
-            undone[i] = frame.replace(depth=faults.undo_fault(source.depth, fault, frame))
-    return undone
-
-
-def _inside(
-    fault: KnownFault, pairs: Sequence[tuple[int, int]], window: Mapping[int, Frame]
-) -> Sequence[tuple[int, int]]:
-    return [(i, j) for i, j in pairs if i + fault.lag in window and j + fault.lag in window]
 
 
 # ---------------------------------------------------------------------------------------------- pictures beside poses
@@ -393,7 +336,7 @@ def _pictures_follow(
     if not tracks.pairs:
         return False
     stated, shifted = (_epipolar_distance(poses, by, window, pairs, tracks) for by in (0, lag))
-    return stated <= _MAX_EPIPOLAR_RATIO * shifted
+    return stated <= 0.7 * shifted
 
 
 def _epipolar_distance(

@@ -37,7 +37,6 @@ from dhtorch.stages.track import lucas_kanade
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
 #: Method that tracks the pairs of a window and fits their motions.
-#: Source: origin not recorded.
 TRACKING_METHOD = Method(
     n=384,
     hypotheses=100,
@@ -47,23 +46,18 @@ TRACKING_METHOD = Method(
 )
 
 #: Largest delay or lead of a map that is tried, frames.
-#: Source: origin not recorded.
 MAX_LAG_FRAMES = 5
 
 #: Fewest samples of a pair's mean loss.
-#: Source: origin not recorded.
 MIN_LOSSES = 12
 
 #: Factors on the focal length that are tried.
-#: Source: origin not recorded.
 FOCAL_FACTORS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 
 #: Fields of view of an unregistered depth over that of its picture that are tried, in steps of about an eighth.
-#: Source: origin not recorded.
 FIELD_OF_VIEW_RATIOS = (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8)
 
 #: Horizontal offsets of an unregistered depth that are tried, as fractions of the width.
-#: Source: origin not recorded.
 SIDEWAYS_SHIFTS = (-0.08, -0.04, 0.04, 0.08)
 
 #: Unit of a depth and the unit it was taken for -> factor that takes it to metres. 1/256 m and 1/5000 m are the steps
@@ -122,25 +116,9 @@ def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
         return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
 
 
-def _is_possible(cause: KnownFault, ratio: float, options: ValidationOptions) -> bool:
-    """Whether a fault is possible at a median ``ratio`` of near returns to the maps; 0 = unknown."""
-    factor = UNIT_FACTORS.get(cause.name)
-    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(options.max_unit_misfit)
-
-
-def _mirrored(depth: Tensor, axis: int) -> Tensor:
-    """Map (…, h, w) flipped along an axis."""
-    return depth.flip(axis)
-
-
 def _inverse(depth: Tensor) -> Tensor:
     """Reciprocal of a map (…, h, w); 0 where it has no value."""
     return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
-
-
-def _times(depth: Tensor, factor: float) -> Tensor:
-    """Map (…, h, w) times a factor."""
-    return depth * factor
 
 
 #: Hypothesis without a fault.
@@ -148,9 +126,9 @@ NO_FAULT = KnownFault("none", "none")
 
 #: Hypotheses with a fault.
 KNOWN_FAULTS: tuple[KnownFault, ...] = (
-    *(KnownFault("unit", name, partial(_times, factor=factor)) for name, factor in UNIT_FACTORS.items()),
-    KnownFault("mirrored", "mirrored left to right", partial(_mirrored, axis=-1)),
-    KnownFault("mirrored", "mirrored upside down", partial(_mirrored, axis=-2)),
+    *(KnownFault("unit", name, partial(torch.mul, other=factor)) for name, factor in UNIT_FACTORS.items()),
+    KnownFault("mirrored", "mirrored left to right", partial(torch.flip, dims=(-1,))),
+    KnownFault("mirrored", "mirrored upside down", partial(torch.flip, dims=(-2,))),
     KnownFault("along the ray", "distance along the ray, not depth", ray=True),
     KnownFault("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
     *(KnownFault("rolled", f"rolled by {90 * k} degrees", partial(rot90_map, quarters=4 - k)) for k in (1, 2, 3)),
@@ -408,16 +386,18 @@ class FaultWindow:
         if self.references.T_world_from_cam is None or self.others.T_world_from_cam is None:
             absorbed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
         hypotheses = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind not in absorbed)]
-        ratio = 0.0 if self.maps is None else self._return_to_map_ratio(self.maps)
-        return [cause for cause in hypotheses if _is_possible(cause, ratio, self.options)]
-
-    def _return_to_map_ratio(self, maps: Sequence[Tensor]) -> float:
-        """Median ratio of near returns to the maps there; 0 without any."""
+        if self.maps is None:
+            return hypotheses
         samples = self.method.backproject(self.references, self.samples.uv)
-        depth = torch.cat([maps[i] for i, _ in self.pairs]).to(samples.depth)
+        depth = torch.cat([self.maps[i] for i, _ in self.pairs]).to(samples.depth)
         returned = torch.where(samples.usable, samples.depth, 0.0)
-        ratio = _median_ratio(returned, _sample_map(depth, self.samples.uv, self.references.hw))
-        return float(ratio[ratio > 0].median()) if bool((ratio > 0).any()) else 0.0
+        ratios = _median_ratio(returned, _sample_map(depth, self.samples.uv, self.references.hw))
+        if not bool((ratios > 0).any()):
+            return hypotheses
+        # A unit must be possible at the median ratio of near returns to the maps.
+        ratio, limit = float(ratios[ratios > 0].median()), math.log(self.options.max_unit_misfit)
+        units = {name for name, factor in UNIT_FACTORS.items() if not abs(math.log(ratio / factor)) < limit}
+        return [cause for cause in hypotheses if cause.name not in units]
 
     def explains(self, cause: KnownFault) -> bool:
         """Whether undoing the fault removes most of the maps' loss beyond that of the sensor's returns.
@@ -582,36 +562,25 @@ def track_window(
     Gradient: none.
     """
     pair_of_frame: dict[int, tuple[int, Samples, Tracks]] = {}
-    for gap in [gap for gap in options.pair_gaps if gap < len(frames)]:
-        first_frames = [
-            i for i in _reference_frames(len(frames), options) if i not in pair_of_frame and i + gap < len(frames)
-        ]
+    # Reference views, evenly spread, far enough from the ends of the window for earlier and later maps.
+    n, steps = len(frames), options.max_window_pairs - 1
+    low, high = (MAX_LAG_FRAMES, n - 1 - MAX_LAG_FRAMES) if n > 3 * MAX_LAG_FRAMES else (0, n - 2)
+    spread = sorted({low + round((high - low) * k / steps) for k in range(options.max_window_pairs)})
+    for gap in [gap for gap in options.pair_gaps if gap < n]:
+        first_frames = [i for i in spread if i not in pair_of_frame and i + gap < n]
         if not first_frames:
             continue
         with torch.no_grad():
-            samples, tracks = _track_pairs(
-                [frames[i] for i in first_frames], [frames[i + gap] for i in first_frames], method
-            )
-        textured = (samples.trackability >= method.min_trackability).sum(-1).clamp_min(1)
-        is_tracked = tracks.valid.sum(-1) >= options.min_tracked_ratio * textured
+            references = [frames[i] for i in first_frames]
+            others = [frames[i + gap] for i in first_frames]
+            samples = method.sample_depth(pytree.collate(references))
+            tracks = method.track(pytree.collate(references).image, pytree.collate(others).image, samples.uv)
+            is_textured = samples.trackability >= method.min_trackability
+            tracks = tracks.replace(valid=tracks.valid & is_textured)
+        is_tracked = tracks.valid.sum(-1) >= options.min_tracked_ratio * is_textured.sum(-1).clamp_min(1)
         for k, i in enumerate(first_frames):
             if bool(is_tracked[k]):
                 pair_of_frame[i] = gap, samples[k : k + 1], tracks[k : k + 1]
     frame_order = sorted(pair_of_frame)
     pairs = [(i, i + pair_of_frame[i][0]) for i in frame_order]
     return WindowTracks(pairs, [pair_of_frame[i][1] for i in frame_order], [pair_of_frame[i][2] for i in frame_order])
-
-
-def _track_pairs(references: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
-    """Samples of frames, and their tracks into other frames."""
-    samples = method.sample_depth(pytree.collate(references))
-    tracks = method.track(pytree.collate(references).image, pytree.collate(others).image, samples.uv)
-    return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
-
-
-def _reference_frames(n: int, options: ValidationOptions) -> list[int]:
-    """Reference views of a window, evenly spread, far enough from its ends for earlier and later maps."""
-    low, high = (MAX_LAG_FRAMES, n - 1 - MAX_LAG_FRAMES) if n > 3 * MAX_LAG_FRAMES else (0, n - 2)
-    return sorted(
-        {low + round((high - low) * k / (options.max_window_pairs - 1)) for k in range(options.max_window_pairs)}
-    )

@@ -10,48 +10,38 @@ from typing import Final
 @dataclass(frozen=True)
 class ValidationOptions:
     """Options of :func:`dhtorch.validation.validate.validate_depth` and :func:`dhtorch.validation.faults.diagnose`:
-    their tuning constants with meaning, unit and origin."""
+    their tuning constants with meaning and unit, and their origin where it is known."""
 
     # Evidence
 
     #: Error, as a log ratio, that evidence must be able to detect to support a pixel: 20 %.
-    #: Source: origin not recorded.
     detectable_log_ratio: float = math.log(1.2)
 
     #: Sigmas at which an error of ``detectable_log_ratio`` must stand for evidence to support a pixel.
-    #: Source: origin not recorded.
     detection_sigmas: float = 3.0
 
     #: Radius around a sparse reference within which it is evidence, grid pixels.
-    #: Source: origin not recorded.
     support_radius_px: int = 8
 
     #: Largest depth difference, as a log ratio, of two pixels on one surface of the map.
-    #: Source: origin not recorded.
     surface_log_ratio: float = 0.06
 
     #: Factors on the map's inverse depth at which rival depths along the ray are tried.
-    #: Source: origin not recorded.
     rival_factors: tuple[float, ...] = (0.3, 0.42, 0.58, 0.75, 0.88, 1.14, 1.33, 1.75, 2.4, 3.4)
 
     #: Least correlation of two windows that show the same surface.
-    #: Source: origin not recorded.
     match_correlation: float = 0.75
 
     #: Least correlation at a rival depth.
-    #: Source: origin not recorded.
     rival_correlation: float = 0.8
 
     #: Radius of the correlation windows, grid pixels.
-    #: Source: origin not recorded.
     evidence_radius_px: int = 4
 
     #: Number of independent errors among the pixels of a window.
-    #: Source: origin not recorded.
     independent_evidence_pixels: float = 8.0
 
     #: Least fraction of a window's pixels with a depth.
-    #: Source: origin not recorded.
     min_filled_ratio: float = 0.6
 
     # Evidence at outlines, and causes of wrong pixels
@@ -103,98 +93,75 @@ class ValidationOptions:
     # States and numbers of a frame
 
     #: Misfit from which on evidence refutes a pixel, sigmas.
-    #: Source: origin not recorded.
     refuting_evidence_sigmas: float = 3.0
 
     #: Misfit up to which evidence supports a pixel, sigmas.
-    #: Source: origin not recorded.
     supporting_evidence_sigmas: float = 2.0
 
     #: Most references that count as independent: they share neighbourhoods of tracks, lens and sensor.
-    #: Source: origin not recorded.
     max_independent_references: int = 60
 
     #: Relative standard deviation of the sensor's metric scale.
-    #: Source: origin not recorded.
     sensor_scale_sigma: float = 0.005
 
     #: Relative standard deviation of a trajectory's metric scale.
-    #: Source: origin not recorded.
     trajectory_scale_sigma: float = 0.02
 
     #: Fewest references of a kind for a scale.
-    #: Source: origin not recorded.
     min_scale_references: int = 8
 
     #: Fewest references for shift and tilt.
-    #: Source: origin not recorded.
     min_shape_references: int = 24
 
     #: A map counts as clipped only if at least this fraction of its pixels equals its largest depth.
-    #: Source: origin not recorded.
     min_plateau_ratio: float = 0.01
 
     #: A map counts as clipped only if at least this fraction of the pixels with evidence at its largest depth is wrong
     #: and too near.
-    #: Source: origin not recorded.
     min_clipped_wrong_ratio: float = 0.1
 
     #: A map counts as clipped only if that fraction exceeds the one of all other pixels by this factor.
-    #: Source: origin not recorded.
     clipped_rate_factor: float = 2.0
 
     # Diagnosis of faults
 
     #: Miss at which the loss of a sample is a half, px of a picture 640 wide.
-    #: Source: origin not recorded.
     half_loss_px: float = 2.0
 
     #: Least mean loss that a fault must save over no fault.
-    #: Source: origin not recorded.
     min_loss_saved: float = 0.04
 
     #: Least number of its standard errors over the pairs that the saved loss must reach.
-    #: Source: origin not recorded.
     min_standard_errors: float = 3.0
 
     #: Least margin in mean loss of a fault over the best one of another kind.
-    #: Source: origin not recorded.
     min_margin_over_others: float = 0.015
 
     #: Least fraction of the loss beyond that of the sensor's near returns that a fault must explain.
-    #: Source: origin not recorded.
     min_explained_ratio: float = 0.75
 
     #: Without motions: ratio of a map to a near return at which the loss is a half.
-    #: Source: origin not recorded.
     half_loss_ratio: float = 1.1
 
     #: Without motions: longer side of the grid of near returns.
-    #: Source: origin not recorded.
     return_grid_side: int = 64
 
     #: Largest translation of a static camera, as a fraction of the median return.
-    #: Source: origin not recorded.
     static_baseline_ratio: float = 0.005
 
     #: Largest factor between a unit and the median ratio of near returns to the map at which the unit is tried.
-    #: Source: origin not recorded.
     max_unit_misfit: float = 2.0
 
     #: Most pairs of a window.
-    #: Source: origin not recorded.
     max_window_pairs: int = 8
 
     #: Fewest pairs (or frames) of a diagnosis.
-    #: Source: origin not recorded.
     min_window_pairs: int = 4
 
     #: Frames from the first to the second of a pair, tried in this order.
-    #: Source: origin not recorded.
     pair_gaps: tuple[int, ...] = (8, 4, 2, 1)
 
     #: Least fraction of the textured samples that a pair must track.
-    #: Source: origin not recorded.
     min_tracked_ratio: float = 0.4
 
     @property

@@ -20,21 +20,13 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.records import Camera, Frame, Pose, Samples, Tracks
-from dhtorch.validation.edge_lag import clear_lead
+from dhtorch.validation.edges import clear_lead
 from dhtorch.validation.faults import MIN_LOSSES, bounded_loss
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 
 #: Factors on the focal length that are tried first: pictures cropped to 1 / factor of their field, or seen over more.
 #: Source: derived, steps of about a tenth, whose misses are within those of tracks over 40 px.
 _ZOOMS: Final = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.33, 1.5, 1.7, 2.0)
-
-#: Places of a crop in the whole picture that are tried first: −1 = at the left or upper end, 0 = in the middle.
-#: Source: derived, a quarter of the way that a crop can lie away from the middle, whose misses are within 40 px.
-_PLACES: Final = (-1.0, -0.5, 0.0, 0.5, 1.0)
-
-#: Rounds of refinement around the best camera, each with half the steps.
-#: Source: derived, 0.1 / 2³ is about a hundredth.
-_REFINEMENTS: Final = 3
 
 #: Another camera is reported if its loss is at most this fraction of that of the stated one.
 #: Source: chosen on the sound captures of the shared data (fractions of 0.91 and more, differences up to 0.04) and on
@@ -43,20 +35,6 @@ _MAX_LOSS_RATIO: Final = 0.86
 
 #: Least difference of the two losses for that. Source: chosen on the same captures and pictures.
 _MIN_LOSS_DIFFERENCE: Final = 0.1
-
-#: Least lead in standard errors over the pairs. Source: derived, two: pairs are few, and each has many tracks.
-_MIN_LEAD_ERRORS: Final = 2.0
-
-#: Fewest pairs of frames: three parameters fit a few tracks by chance.
-#: Source: derived, as the pairs that must have tracks in :mod:`dhtorch.validation.pose_check`.
-_MIN_PAIRS: Final = 3
-
-#: Fewest tracks of a pair. Source: derived, twenty for each of the three parameters.
-_MIN_TRACKS: Final = 60
-
-#: Least width of pictures, px: a fifth of a pixel, the error of tracks, must be below two pixels of 640.
-#: Source: derived, 640 px * 0.2 px / 2 px = 64 px, and half as much again.
-_MIN_WIDTH_PX: Final = 96
 
 #: Least change of the focal length that is reported.
 #: Source: chosen on the sound captures of the shared data: up to 0.05 in 7-Scenes, whose K is that of the data sheet.
@@ -111,18 +89,28 @@ def measure_picture_field(
     Gradient: none.
     """
     with torch.no_grad():
-        returns = [_of_pair(poses, frames, *each) for each in zip(pairs, tracks, strict=True)]
+        returns = []
+        for (i, j), (samples, track) in zip(pairs, tracks, strict=True):
+            T = se3.relative(poses[i : i + 1], poses[j : j + 1]).map(lambda x: x.to(samples.uv.dtype))  # noqa: B023
+            used = track.valid[0]
+            returns.append(_Returns(frames[i], frames[j], samples.uv[:, used], track.uv_1[:, used], T))
         stated = torch.tensor([[1.0, 0.0, 0.0]])
-        coarse = [(zoom, *(p * abs(zoom - 1) / zoom / 2 for p in place)) for zoom in _ZOOMS for place in _places(zoom)]
-        fields = torch.tensor(coarse)
+        corners = list(itertools.product((-1.0, -0.5, 0.0, 0.5, 1.0), repeat=2))  # whose misses are within 40 px
+        fields = torch.tensor(
+            [
+                (zoom, *(p * abs(zoom - 1) / zoom / 2 for p in place))
+                for zoom in _ZOOMS
+                for place in (corners if zoom > 1 else [(0.0, 0.0)])
+            ]
+        )
         stated_losses = _pair_losses(returns, stated)
-        if len(stated_losses) < _MIN_PAIRS:
+        if len(stated_losses) < 3:  # three parameters fit a few tracks by chance
             return None
         best, losses = _best(returns, fields)
-        for k in range(1, _REFINEMENTS + 1):
+        for k in (1, 2, 3):  # each with half the steps: 0.1 / 2³ is about a hundredth
             steps = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
             best, losses = _best(returns, best + steps * torch.tensor([0.1, 0.05, 0.05]) / 2**k)
-    lead = clear_lead(stated_losses[:, 0] - losses, _MIN_LOSS_DIFFERENCE, _MIN_LEAD_ERRORS)
+    lead = clear_lead(stated_losses[:, 0] - losses, _MIN_LOSS_DIFFERENCE, errors=2.0)
     zoom, *shift = best.tolist()
     return PictureField(zoom, (shift[0], shift[1]), float(losses.mean()), float(stated_losses.mean()), lead)
 
@@ -132,20 +120,6 @@ def _best(returns: Sequence[_Returns], fields: Tensor) -> tuple[Tensor, Tensor]:
     losses = _pair_losses(returns, fields)
     k = int(losses.mean(0).argmin())
     return fields[k], losses[:, k]
-
-
-def _places(zoom: float) -> list[tuple[float, ...]]:
-    """Places of the pictures within the stated field; the middle where they show more than it."""
-    return list(itertools.product(_PLACES, repeat=2)) if zoom > 1 else [(0.0, 0.0)]
-
-
-def _of_pair(
-    poses: Pose, frames: Mapping[int, Frame], pair: tuple[int, int], tracked: tuple[Samples, Tracks]
-) -> _Returns:
-    (i, j), (samples, tracks) = pair, tracked
-    T = se3.relative(poses[i : i + 1], poses[j : j + 1]).map(lambda x: x.to(samples.uv.dtype))
-    used = tracks.valid[0]
-    return _Returns(frames[i], frames[j], samples.uv[:, used], tracks.uv_1[:, used], T)
 
 
 def _pair_losses(returns: Sequence[_Returns], fields: Tensor) -> Tensor:
@@ -159,7 +133,9 @@ def _pair_loss(pair: _Returns, fields: Tensor) -> Tensor:
     """Mean loss (H,) of one pair; 1 for returns that a camera does not see; NaN of too few tracks or motions."""
     n = pair.uv_0.shape[1]
     has_pose = bool(pair.T_b_from_a.t.isfinite().all() and pair.T_b_from_a.R.isfinite().all())
-    if pair.a.hw[1] < _MIN_WIDTH_PX or n < _MIN_TRACKS or not has_pose:
+    # The error of tracks, a fifth of a pixel, is to be below two pixels of 640: 64 px wide, and half as much again.
+    # Twenty tracks for each of the three parameters.
+    if pair.a.hw[1] < 96 or n < 60 or not has_pose:
         return fields.new_full((len(fields),), torch.nan)
     camera = _picture_camera(pair.a.camera, pair.a.hw, fields)
     rays = cam.rays(camera, pair.uv_0.expand(len(fields), -1, -1))

@@ -37,7 +37,6 @@ from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 _MAX_RETURNS: Final = 2000
 
 #: Returns that must meet a return for a disagreement.
-#: Source: origin not recorded.
 _MIN_MEETING_RETURNS: Final = 50
 
 #: Factors on translations that are tried around 1, where a factor is not a confusion of units.
@@ -223,7 +222,13 @@ def check_poses(
     with torch.no_grad():
         for k, (i, j) in enumerate(pairs):
             place, motions = _relative_poses(poses, i, j, readings)
-            returns = _sampled_returns(frames[i])
+            # Points (N, 3) m, float64, of returns spread over a frame's depth map
+            frame = frames[i]
+            v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
+            step = max(1, len(v) // _MAX_RETURNS)
+            v, u = v[step // 2 :: step], u[step // 2 :: step]
+            uv = torch.stack((u, v), -1)[None].to(frame.camera.f.dtype)
+            returns = cam.unproject(frame.map_camera, uv, frame.depth[0, v, u][None].to(uv.dtype))[0].double()
             if len(returns) >= _MIN_MEETING_RETURNS:
                 surface[k, place] = depth_disagreement(returns, frames[j], motions)
             if tracks:
@@ -399,15 +404,6 @@ def _relative_poses(poses: Pose, i: int, j: int, readings: Sequence[PoseReading]
     place.append(len(readings))
     motions.append(se3.identity(1, poses.t))
     return torch.tensor(place), Pose(torch.cat([m.R for m in motions]), torch.cat([m.t for m in motions]))
-
-
-def _sampled_returns(frame: Frame) -> Tensor:
-    """Points (N, 3) m, float64, of returns spread over a frame's depth map."""
-    v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
-    step = max(1, len(v) // _MAX_RETURNS)
-    v, u = v[step // 2 :: step], u[step // 2 :: step]
-    uv = torch.stack((u, v), -1)[None].to(frame.camera.f.dtype)
-    return cam.unproject(frame.map_camera, uv, frame.depth[0, v, u][None].to(uv.dtype))[0].double()
 
 
 def _median_over_pairs(values: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pipeline.spec import Trace
+from dhtorch.pipeline.surface import SourceView
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import NO_HINT, DepthValidation, Estimate, Frame, PoseFit, TrackHint
 from dhtorch.runtime.numerics import standard_numerics
@@ -38,7 +39,6 @@ from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOpt
 
 #: Sparse method of a fast validation, with one source view and ``views=False``: some dozens of points determine the
 #: scale, and as few their motion. ``experiment=validate_study`` compares it with the whole method.
-#: Source: origin not recorded.
 QUICK_METHOD = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
 
 
@@ -207,6 +207,19 @@ class _ValidatedMap(NamedTuple):
     number: Tensor  # (views, B) index of the selected views among those passed
     is_sensor_map: bool
 
+    def top_views(self, most: int) -> tuple[plane_sweep.ReferenceView, Tensor, list[SourceView]]:
+        """The reference view on the grid, and the ``most`` informative selected views: their index and pictures."""
+        selected = self.selected
+        base = plane_sweep.make_reference_view(*dense.downscale_grey(self.reference, max(self.grid.shape[-2:])))
+        index, use_view = dense.top_views(selected, most)
+        has_baseline = selected.fits.t_snr > 5  # the translation is significant
+        use_view = selected.fits.ok.gather(0, index) & (use_view | has_baseline.gather(0, index))
+        views = [
+            dense.source_view_of(selected, k, max(base.hw), use, base.image)
+            for k, use in zip(index, use_view, strict=True)
+        ]
+        return base, index, views
+
 
 def _estimate_views(
     method: Method, reference: Frame, others: Frame | Sequence[Frame], trace: Trace, **method_args: Any
@@ -228,12 +241,7 @@ def _view_evidences(
 ) -> tuple[Evidence, Evidence]:
     """Photometric and depth consistency evidence of the most informative views, numbered among the views passed."""
     grid, selected = validated.grid, validated.selected
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(validated.reference, max(grid.shape[-2:])))
-    index, use_view = dense.top_views(selected, source_views)
-    use_view = selected.fits.ok.gather(0, index) & (use_view | _has_baseline(selected).gather(0, index))
-    source_view_list = [
-        dense.source_view_of(selected, k, max(base.hw), use, base.image) for k, use in zip(index, use_view, strict=True)
-    ]
+    base, index, source_view_list = validated.top_views(source_views)
     pictures = evidence.photometric_evidence(grid, base, source_view_list, tolerance, options)
     batch = torch.arange(len(grid), device=grid.device)
     number = validated.number.gather(0, index)
@@ -247,24 +255,14 @@ def _view_evidences(
         maps = evidence.depth_consistency_evidence(
             grid, base, source_view_list, [_finite_positive(depth) for depth in depths], tolerance, options
         )
-    return _renumber_views(pictures, number), _renumber_views(maps, number)
+    return tuple(kind._replace(view=_renumber_views(kind.view, number)) for kind in (pictures, maps))  # type: ignore[return-value]
 
 
 def _outline_evidence(validated: _ValidatedMap, options: ValidationOptions) -> wrong_causes.RefutedPixels:
     """Evidence at outlines from all views with a motion, numbered among the views passed."""
-    grid, selected = validated.grid, validated.selected
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(validated.reference, max(grid.shape[-2:])))
-    index, use_view = dense.top_views(selected, len(selected.fits.code))
-    use_view = selected.fits.ok.gather(0, index) & (use_view | _has_baseline(selected).gather(0, index))
-    source_view_list = [
-        dense.source_view_of(selected, k, max(base.hw), use, base.image) for k, use in zip(index, use_view, strict=True)
-    ]
-    at_outlines = wrong_causes.outline_evidence(grid, base, source_view_list, options)
-    number = validated.number.gather(0, index)
-    batch = torch.arange(len(grid), device=grid.device)[:, None, None]
-    view = at_outlines.view
-    place = number[view.clamp_min(0).long(), batch].to(torch.int32)
-    return at_outlines._replace(view=torch.where(view >= 0, place, view))
+    base, index, source_view_list = validated.top_views(len(validated.selected.fits.code))
+    at_outlines = wrong_causes.outline_evidence(validated.grid, base, source_view_list, options)
+    return at_outlines._replace(view=_renumber_views(at_outlines.view, validated.number.gather(0, index)))
 
 
 def _flying_pixels(
@@ -280,16 +278,11 @@ def _flying_pixels(
     return wrong_causes.RefutedPixels(*(_resize_nearest(x, hw) for x in flying))
 
 
-def _has_baseline(selected: dense.SelectedViews) -> Tensor:
-    """Whether the translation to a view is significant, (V, B)."""
-    return selected.fits.t_snr > 5
-
-
-def _renumber_views(kind: Evidence, number: Tensor) -> Evidence:
-    """Evidence with view indices among the views passed, ``number`` (V, B) of the selected ones."""
+def _renumber_views(view: Tensor, number: Tensor) -> Tensor:
+    """Indices (B, h, w) of selected views -> among the views passed, ``number`` (V, B) of the selected ones."""
     batch = torch.arange(number.shape[1], device=number.device)[:, None, None]
-    place = number[kind.view.clamp_min(0).long(), batch].to(torch.int32)
-    return kind._replace(view=torch.where(kind.view >= 0, place, kind.view))
+    place = number[view.clamp_min(0).long(), batch].to(torch.int32)
+    return torch.where(view >= 0, place, view)
 
 
 # -------------------------------------------------------------------------------------------------- maps on one grid

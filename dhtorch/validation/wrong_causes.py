@@ -56,7 +56,7 @@ _MAX_GAIN = 8.0
 _LEVEL_RATIO = 0.1
 
 #: Fraction of the largest inverse depth by which an occluding pixel must be nearer.
-#: The same as in dhtorch.validation.evidence. Source: origin not recorded.
+#: The same as in dhtorch.validation.evidence.
 _OCCLUSION_STEP = 0.03
 
 
@@ -137,7 +137,9 @@ def outline_evidence(
     misfit = torch.full_like(depth, torch.nan)
     best_view = torch.full_like(depth, -2, dtype=torch.int32)
     unsupported = torch.zeros_like(depth, dtype=torch.bool)
-    weight = _similar_grey(base.image[:, 0])
+    grey = base.image[:, 0]
+    difference = _windows(grey, _OUTLINE_WINDOW_RADIUS_PX) - grey[:, None]
+    weight = (-difference.abs() / _SIMILAR_GREY).exp().nan_to_num(0.0)
     own = torch.where(_occluded(depth, base, source_views), torch.nan, _grey_misfits(depth, base, source_views))
     for far in (True, False):
         rival = extend_surface(depth, options.outline_reach_px, options.side_ratio, far=far)
@@ -157,12 +159,6 @@ def _windows(x: Tensor, radius: int) -> Tensor:
     """Map (B, h, w) -> values (B, n, h, w) of the n pixels in the window around each, NaN outside the map."""
     padded = F.pad(x[:, None], (radius,) * 4, value=torch.nan)
     return F.unfold(padded, 2 * radius + 1).unflatten(2, x.shape[-2:])
-
-
-def _similar_grey(grey: Tensor) -> Tensor:
-    """Weights (B, n, h, w) of the pixels in the window around each: less for other grey values, 0 outside."""
-    difference = _windows(grey, _OUTLINE_WINDOW_RADIUS_PX) - grey[:, None]
-    return (-difference.abs() / _SIMILAR_GREY).exp().nan_to_num(0.0)
 
 
 def _occluded(depth: Tensor, base: plane_sweep.ReferenceView, source_views: list[surface.SourceView]) -> Tensor:
@@ -243,7 +239,14 @@ def name_causes(
     """
     wrong = state == State.WRONG
     below_range = (point_depth < options.min_sensor_range_m) & (depth > options.ghost_ratio * point_depth)
-    ghost = _same_surface(wrong & below_range, depth, options.surface_log_ratio)
+    # Mask (B, h, w) grown over neighbouring pixels of similar depth, by ``_MAX_GHOST_RADIUS_PX``
+    mask = wrong & below_range
+    grown = torch.where(mask, depth, 0.0)
+    for _ in range(_MAX_GHOST_RADIUS_PX):
+        beside = F.max_pool2d(grown[:, None], 3, 1, 1)[:, 0]
+        level = (depth / beside.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < options.surface_log_ratio
+        grown = torch.where((grown == 0) & (depth > 0) & level, depth, grown)
+    ghost = grown > 0
     steps, ratio = options.outline_reach_px, options.side_ratio
     has_farther, has_nearer = (extend_surface(depth, steps, ratio, far=far) != depth for far in (True, False))
     bleeds = (has_farther & (misfit < 0)) | (has_nearer & (misfit > 0))
@@ -254,16 +257,6 @@ def name_causes(
         (bleeds & ~_is_wide(wrong & ~flying, steps), WrongCause.EDGE_BLEED),
         otherwise=WrongCause.OTHER,
     )
-
-
-def _same_surface(mask: Tensor, depth: Tensor, max_log_ratio: float) -> Tensor:
-    """Mask (B, h, w) grown over neighbouring pixels of similar depth, by ``_MAX_GHOST_RADIUS_PX``."""
-    grown = torch.where(mask, depth, 0.0)
-    for _ in range(_MAX_GHOST_RADIUS_PX):
-        beside = F.max_pool2d(grown[:, None], 3, 1, 1)[:, 0]
-        level = (depth / beside.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < max_log_ratio
-        grown = torch.where((grown == 0) & (depth > 0) & level, depth, grown)
-    return grown > 0
 
 
 def _is_wide(mask: Tensor, radius: int) -> Tensor:

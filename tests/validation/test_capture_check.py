@@ -21,7 +21,7 @@ from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.camera import Camera
 from dhtorch.records import Frame, Pose
 from dhtorch.validation import capture_check, picture_field
-from dhtorch.validation.capture_check import CaptureCheck, Finding, check_capture
+from dhtorch.validation.capture_check import Finding, check_capture
 from dhtorch.validation.faults import KNOWN_FAULTS
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.picture_field import PictureField
@@ -47,16 +47,10 @@ def recording(frames, poses=None, **fields):
     return Recording("walk", "made", frames.__getitem__, torch.arange(len(frames)), poses=poses, **fields)
 
 
-def options_of(remedy):
-    """Text of a remedy → options of a capture."""
-    name, _, value = remedy.removeprefix("data.").partition("=")
-    return {name: int(value) if name == "depth_lag" else value}
-
-
 def undone(check, spoilt):
-    """The recording with the option of the only finding."""
-    (finding,) = check.findings
-    return Corrections.from_options(options_of(finding.remedy)).apply(spoilt)
+    """The recording with the option of the last finding."""
+    name, _, value = check.findings[-1].remedy.removeprefix("data.").partition("=")
+    return Corrections.from_options({name: int(value) if name == "depth_lag" else value}).apply(spoilt)
 
 
 def test_a_sound_capture_has_no_finding(frames, true):
@@ -65,76 +59,92 @@ def test_a_sound_capture_has_no_finding(frames, true):
     assert check.assumed_unit == ASSUMED and check.lines == [ASSUMED, "a remark"]
     assert check.reported.poses is true and check.reported.report == (ASSUMED, "a remark")
     assert check.poses.surfaces.stated < 0.01
+    for unit in (DepthUnit(0.001, "camera.json: scale"), None):  # a stated one is not announced
+        stated = check_capture(recording(frames[:2], depth_unit=unit, report=()))
+        assert stated.lines == [] and stated.poses is None and stated.assumed_unit == ""
 
 
-def test_a_stated_unit_is_not_announced(frames):
-    check = check_capture(recording(frames, depth_unit=DepthUnit(0.001, "camera.json: scale"), report=()))
-    assert check.lines == [] and check.poses is None and check.assumed_unit == ""
-    assert check_capture(recording(frames, depth_unit=None, report=())).lines == []
+SLOW = pytest.mark.slow
+NOISE = torch.Generator().manual_seed(0)
+SCALE = "which one, depth and poses alone do not show"
 
 
-@pytest.mark.parametrize(
-    "convention",
-    [
-        "mm",
-        *(
-            pytest.param(c, marks=pytest.mark.slow)
-            for c in ("wxyz", "world_to_camera", "opengl", "world_to_camera+opengl")
-        ),
-    ],
-)
-def test_refuted_poses_are_named_and_removed(convention, frames, true):
-    parsed = parse_pose_convention(convention)
-    spoilt = recording(frames, state_poses(true, parsed))
+def late(lag, has_poses):
+    """Frames whose depth comes ``lag`` frames late, and their positions."""
+
+    def plant(frames, true):
+        inside = [k for k in range(N) if 0 <= k - lag < N]
+        shown = [frames[k].replace(depth=frames[k - lag].depth) for k in inside]
+        return recording(shown, true[torch.tensor(inside)] if has_poses else None)
+
+    return plant
+
+
+def changed(change, has_poses=True):
+    return lambda frames, true: recording([change(frame) for frame in frames], true if has_poses else None)
+
+
+def with_camera(f, c, by=lambda x: x):
+    return lambda frame: frame.replace(
+        camera=frame.camera.replace(f=f * by(frame.camera.f), c=f * by(frame.camera.c) + c)
+    )
+
+
+#: Planted fault -> (recording, cause, words, remedy).
+PLANTED = {
+    **{
+        c: (lambda frames, true, c=c: recording(frames, state_poses(true, parse_pose_convention(c))), "poses",
+            f"{parse_pose_convention(c).describe()}.*they are not used", f"data.pose_convention={c}")
+        for c in ("mm", "wxyz", "world_to_camera", "opengl", "world_to_camera+opengl")
+    },
+    **{
+        f"lag {lag}": (late(lag, has_poses), "time offset", f"depth is {words} against", f"data.depth_lag={lag}")
+        for lag, has_poses, words in ((1, True, "1 frame late"), (-2, True, "2 frames early"), (3, False, "3 frames late"))
+    },
+    **{
+        turn: (changed(lambda f, d=d: f.replace(depth=f.depth.flip(d))), "rolled" if turn == "180" else "mirrored",
+               "depth and pictures differ in orientation: depth is ", f"data.depth_turn={turn}")
+        for turn, d in (("left_right", -1), ("upside_down", -2), ("180", (-2, -1)))
+    },
+    "factor": (changed(lambda f: f.replace(depth=1.1 * f.depth)), "scale", f"depth is 1.1.*{SCALE}", ""),
+    "unit": (changed(lambda f: f.replace(depth=5 * f.depth)), "poses", "depth unit may be 1/5000 m", "data.depth_unit=0.0002"),
+    "noise": (
+        changed(lambda f: f.replace(depth=torch.rand(f.depth.shape, generator=NOISE) * 9 + 1)),
+        "plausibility", "depths of two frames disagree by", ""),
+    "exchanged": (
+        changed(with_camera(1, 0, lambda x: x.flip(-1))), "intrinsics",
+        "cx and cy .and fx and fy. look exchanged", "data.K=[fx,fy,cx,cy]"),
+    "larger": (
+        changed(with_camera(2, 0.5), has_poses=False), "intrinsics",
+        "the intrinsics look like those of pictures 1.98 times as large", "data.K=[fx,fy,cx,cy]"),
+}  # fmt: skip
+
+QUICK = ("mm", "lag 3", "left_right", "factor", "unit", "noise", "exchanged", "larger")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[SLOW] * (name not in QUICK)) for name in PLANTED])
+def test_a_planted_fault_is_named_with_the_option_that_undoes_it(name, frames, true):
+    plant, cause, words, remedy = PLANTED[name]
+    spoilt = plant(frames, true)
     check = check_capture(spoilt)
-    (finding,) = check.findings
-    assert finding.cause == "poses" and parsed.describe() in finding.text and "they are not used" in finding.text
-    assert finding.remedy == f"data.pose_convention={convention}"
-    assert check.poses_refuted and check.recording.poses is None and spoilt.poses is not None
-    corrected = undone(check, spoilt)
-    torch.testing.assert_close(corrected.poses.t, true.t, atol=1e-9, rtol=0)
-    torch.testing.assert_close(corrected.poses.R, true.R, atol=1e-6, rtol=0)
-    assert check.reported.poses is None and check.reported.report[-1] == str(finding)
-    assert check.lines[-1].endswith(f"(remedy: data.pose_convention={convention})")
-
-
-@pytest.mark.parametrize(
-    ("lag", "has_poses"), [*(pytest.param(lag, True, marks=pytest.mark.slow) for lag in (1, -2)), (3, False)]
-)
-def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
-    inside = [k for k in range(N) if 0 <= k - lag < N]
-    late = [frames[k].replace(depth=frames[k - lag].depth) for k in inside]
-    spoilt = recording(late, true[torch.tensor(inside)] if has_poses else None)
-    check = check_capture(spoilt)
-    (finding,) = check.findings
-    assert finding.cause == "time offset" and finding.remedy == f"data.depth_lag={lag}"
-    shown = f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'} against "
-    assert f"depth is {shown}" in finding.text and not check.poses_refuted
-    for frame, number in zip(corrected := undone(check, spoilt), undone(check, spoilt).number, strict=True):
-        assert torch.equal(frame.depth, frames[inside[int(number)]].depth)
-    assert not check_capture(corrected).findings
-
-
-@pytest.mark.parametrize(
-    "turn", ["left_right", *(pytest.param(turn, marks=pytest.mark.slow) for turn in ("upside_down", "180"))]
-)
-def test_turned_depth_is_named_with_its_turn(turn, frames, true):
-    flip = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[turn]
-    spoilt = recording([f.replace(depth=f.depth.flip(flip)) for f in frames], true)
-    check = check_capture(spoilt)
-    (finding,) = check.findings
-    assert finding.cause == ("rolled" if turn == "180" else "mirrored")
-    assert finding.text.startswith("depth and pictures differ in orientation: depth is ")
-    assert finding.remedy == f"data.depth_turn={turn}" and not check.poses_refuted
-    assert torch.equal(undone(check, spoilt)[2].depth, frames[2].depth)
-
-
-def test_a_factor_near_1_is_a_scale_without_a_culprit(frames, true):
-    check = check_capture(recording([f.replace(depth=1.1 * f.depth) for f in frames], true))
-    (finding,) = check.findings
-    assert finding.cause == "scale" and not check.poses_refuted and finding.remedy == ""
-    assert "depth is 1.1" in finding.text and "which one, depth and poses alone do not show" in finding.text
-    assert str(finding) == finding.text
+    finding = next(each for each in check.findings if re.search(words, each.text))
+    assert (finding.cause, finding.remedy) == (cause, remedy) and str(finding) in check.lines
+    assert str(finding) == (f"{finding.text} (remedy: {remedy})" if remedy else finding.text)
+    assert check.poses_refuted == any(each.cause == "poses" for each in check.findings)
+    assert (check.reported.poses is None) == (check.poses_refuted or spoilt.poses is None)
+    assert check.reported.report[-1] == check.lines[-1]
+    if name in ("noise", "exchanged", "larger"):
+        return
+    assert len(check.findings) == 1 or name == "unit"
+    if remedy:
+        corrected = undone(check, spoilt)
+        for frame, number in zip(corrected, corrected.number, strict=True):
+            k = int(number) + max(0, int(name[4:])) if name.startswith("lag") else int(number)
+            torch.testing.assert_close(frame.depth, frames[k].depth)
+        if cause == "poses" and name != "unit":
+            torch.testing.assert_close(corrected.poses.t, true.t, atol=1e-9, rtol=0)
+            torch.testing.assert_close(corrected.poses.R, true.R, atol=1e-6, rtol=0)
+        assert not check_capture(corrected).findings or name == "unit"
 
 
 @pytest.mark.parametrize(
@@ -170,40 +180,6 @@ def test_a_motion_that_does_not_show_the_scale_is_stated(frames, true):
     assert limit.startswith("the scale of depth and poses is not checked exactly: an error of a third or less")
 
 
-def test_depth_in_another_unit_is_named(frames, true):
-    """Steps of 1/5000 m that are read as millimetres."""
-    spoilt = recording([f.replace(depth=5 * f.depth) for f in frames], true)
-    check = check_capture(spoilt)
-    finding = next(each for each in check.findings if each.cause == "poses")
-    assert "the depth unit may be 1/5000 m" in finding.text and finding.remedy == "data.depth_unit=0.0002"
-    corrected = Corrections(depth_unit="0.0002").apply(spoilt)
-    torch.testing.assert_close(corrected[1].depth, frames[1].depth)
-
-
-def test_depth_that_disagrees_with_itself_is_named(frames, true):
-    """Returns of a random depth in every frame, by which no reading of the poses agrees."""
-    noise = torch.Generator().manual_seed(0)
-    random = [f.replace(depth=torch.rand(f.depth.shape, generator=noise) * 9 + 1) for f in frames]
-    findings = check_capture(recording(random, true)).findings
-    assert any("depths of two frames disagree by" in finding.text for finding in findings)
-
-
-def test_exchanged_intrinsics_are_named(frames, true):
-    def exchanged(frame):
-        return frame.replace(camera=frame.camera.replace(f=frame.camera.f.flip(-1), c=frame.camera.c.flip(-1)))
-
-    causes = check_capture(recording([exchanged(f) for f in frames], true)).findings
-    assert causes[0].cause == "intrinsics" and "cx and cy (and fx and fy) look exchanged" in causes[0].text
-    assert causes[0].remedy == "data.K=[fx,fy,cx,cy]"
-
-
-def test_intrinsics_of_larger_pictures_are_named(frames):
-    twice = [f.replace(camera=f.camera.replace(f=2 * f.camera.f, c=2 * f.camera.c + 0.5)) for f in frames[:3]]
-    finding = check_capture(recording(twice)).findings[0]
-    assert finding.cause == "intrinsics" and finding.remedy == "data.K=[fx,fy,cx,cy]"
-    assert "the intrinsics look like those of pictures 1.98 times as large" in finding.text
-
-
 def test_the_window_is_where_the_camera_moves_and_broken_frames_are_left_out(frames, true):
     """A capture that stands still, then walks; frames are decoded only in the window, unreadable ones left out."""
     still = 30
@@ -223,12 +199,11 @@ def test_the_window_is_where_the_camera_moves_and_broken_frames_are_left_out(fra
     assert min(decoded) >= still + N - 20 and still + N - 1 in decoded
 
 
-def test_frames_that_are_decoded_already_are_not_decoded_again(frames, true):
-    def load(i):
-        raise AssertionError(f"frame {i} was decoded")
-
-    whole = Recording("walk", "made", load, torch.arange(N), poses=true)
+def test_frames_that_are_decoded_already_are_not_decoded_again_nor_poses_checked_by_sparse_depth(frames, true):
+    whole = Recording("walk", "made", {}.__getitem__, torch.arange(N), poses=true)
     assert check_capture(whole, dict(enumerate(frames))).poses.n_pairs > 2
+    check = check_capture(recording(frames, state_poses(true, parse_pose_convention("mm")), sparse=True))
+    assert check.poses is None and check.diagnosis is None and not check.poses_refuted
 
 
 @pytest.mark.slow
@@ -245,23 +220,10 @@ def test_little_is_enough(frames, true):
     assert check_capture(recording(frames, lost)).poses is None
 
 
-def test_poses_are_not_checked_by_sparse_depth(frames, true):
-    check = check_capture(recording(frames, state_poses(true, parse_pose_convention("mm")), sparse=True))
-    assert check.poses is None and check.diagnosis is None and not check.poses_refuted
-
-
 def test_pictures_of_two_sizes_are_checked_without_tracks(frames, true):
     mixed = [f if k % 2 else f.replace(image=f.image[..., ::2, ::2]) for k, f in enumerate(frames)]
     mixed = [f if k % 2 else f.replace(depth=f.depth[..., ::2, ::2]) for k, f in enumerate(mixed)]
     assert check_capture(recording(mixed, true)).diagnosis is None
-
-
-def test_lines_and_words_of_findings():
-    finding = Finding("poses", "wrong", "data.x=1")
-    assert str(finding) == "wrong (remedy: data.x=1)" and str(Finding("scale", "wrong")) == "wrong"
-    check = CaptureCheck(recording([None]), findings=(finding, Finding("scale", "far")))
-    assert check.poses_refuted and check.lines == ["a remark", "wrong (remedy: data.x=1)", "far"]
-    assert not CaptureCheck(recording([None]), findings=(Finding("scale", "far"),)).poses_refuted
 
 
 def test_a_fault_names_the_option_that_undoes_it():

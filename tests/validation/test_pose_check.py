@@ -60,10 +60,6 @@ def exact_tracks(a, b):
     return samples, Tracks(uv, end, ones, ones, cov, torch.ones(1, 60, dtype=torch.bool))
 
 
-def scores(stated, without, best, best_score):
-    return ReadingScores(stated, without, best, best_score)
-
-
 def test_true_poses_agree(frames, true, tracks):
     for by in ((), tracks):
         check = check_poses(true, frames, PAIRS, by)
@@ -225,39 +221,37 @@ def test_a_scale_error_goes_unnoticed_up_to_the_factors_whose_score_is_hardly_wo
 
 
 def check_of(stated, best_score, best=UP_BACK, without=0.1, tracks=None, factor=1.0):
-    return PoseCheck(scores(stated, without, best, best_score), tracks, factor, 4)
+    return PoseCheck(ReadingScores(stated, without, best, best_score), tracks, factor, 4)
 
 
 @pytest.mark.parametrize(
-    ("stated", "best_score", "refuted"),
+    ("stated", "best_score", "best", "without", "refuted"),
     [
-        (0.021, 0.010, True),  # twice as much and 1 % more
-        (0.019, 0.010, False),
-        (0.0120, 0.0045, False),  # less than 1 % more: three times are needed
-        (0.0120, 0.0035, True),
-        (0.0035, 0.0010, False),  # three times, but less than 0.3 % more
-        (0.0045, 0.0014, True),
+        (0.021, 0.010, UP_BACK, 0.1, True),  # twice as much and 1 % more
+        (0.019, 0.010, UP_BACK, 0.1, False),
+        (0.0120, 0.0045, UP_BACK, 0.1, False),  # less than 1 % more: three times are needed
+        (0.0120, 0.0035, UP_BACK, 0.1, True),
+        (0.0035, 0.0010, UP_BACK, 0.1, False),  # three times, but less than 0.3 % more
+        (0.0045, 0.0014, UP_BACK, 0.1, True),
+        (0.06, 0.05, NONE, 0.04, True),  # no better reading: beyond the bound and beyond no poses
+        (0.06, 0.05, NONE, 0.07, False),
+        (0.04, 0.035, NONE, 0.01, False),
+        (math.nan, 0.01, UP_BACK, 0.1, True),
+        (math.nan, math.nan, UP_BACK, 0.1, False),
     ],
 )
-def test_limits_of_a_contradiction(stated, best_score, refuted):
-    assert check_of(stated, best_score).contradicts == refuted
-
-
-def test_without_a_better_reading_poses_are_refuted_beyond_the_bound_and_beyond_no_poses():
-    assert check_of(0.06, 0.05, NONE, without=0.04).contradicts
-    assert not check_of(0.06, 0.05, NONE, without=0.07).contradicts
-    assert not check_of(0.04, 0.035, NONE, without=0.01).contradicts
-    assert check_of(math.nan, 0.01).contradicts and not check_of(math.nan, math.nan).contradicts
+def test_limits_of_a_contradiction(stated, best_score, best, without, refuted):
+    assert check_of(stated, best_score, best, without).contradicts == refuted
 
 
 def test_tracks_decide_where_they_are_decisive():
     opengl, small = PoseReading(PoseConvention("right_up_back")), PoseReading(PoseConvention(unit=1.025**4))
     sound = (0.01, 0.01)
-    decisive = check_of(*sound, tracks=scores(0.9, 1.0, opengl, 0.3))
+    decisive = check_of(*sound, tracks=ReadingScores(0.9, 1.0, opengl, 0.3))
     assert decisive.by_tracks and decisive.contradicts and decisive.is_explained and decisive.best == opengl
-    assert not check_of(*sound, tracks=scores(0.9, 1.0, opengl, 0.6)).contradicts, "not clearly better"
-    assert not check_of(*sound, tracks=scores(0.15, 1.0, opengl, 0.01)).contradicts, "the stated poses are good"
-    scale = check_of(*sound, tracks=scores(0.9, 1.0, small, 0.3), factor=1.2)
+    assert not check_of(*sound, tracks=ReadingScores(0.9, 1.0, opengl, 0.6)).contradicts, "not clearly better"
+    assert not check_of(*sound, tracks=ReadingScores(0.15, 1.0, opengl, 0.01)).contradicts, "the stated poses are good"
+    scale = check_of(*sound, tracks=ReadingScores(0.9, 1.0, small, 0.3), factor=1.2)
     assert not scale.contradicts and scale.factor == 1.025**4
     assert check_of(*sound, factor=1.2).factor == 1.2
 
