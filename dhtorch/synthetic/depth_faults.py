@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -19,47 +18,11 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.patches import rescale_field_of_view
 
-#: Scale factors of the scale faults, and the shift of the shift fault, m.
-_SCALE_FACTORS, _SHIFT_M = (0.8, 1.25), 0.15
-
-#: Tilt: relative change of depth from one side of the image to the other.
-_TILT_SHARE = 0.10
-
-#: Standard deviations of low-frequency warps, of log depth, and their largest number of waves across the image.
-_WARP_SIGMAS, _MAX_WARP_WAVES = (0.013, 0.05), 2.5
-
-#: Standard deviation of the blur that mixes both sides of an edge, as a fraction of the width.
-_BLUR_SIGMA_REL = 0.012
-
-#: Local jumps: number of objects, the factor on their depth (0.6 m → 1.8 m), the radius of an object as a fraction of
-#: the width, and the largest difference of its log depth from that of its centre.
-_N_JUMPS, _JUMP_FACTOR, _JUMP_RADIUS_REL, _JUMP_MAX_LOG_STEP = 3, 3.0, 0.12, 0.08
-
-#: Invented depth: number of discs filled smoothly, their radius as a fraction of the width, and the largest error.
-_N_DISCS, _DISC_RADIUS_REL, _MAX_INVENTED_REL = 4, 0.10, 0.25
-
 #: Structured light: f · baseline of the disparity f · baseline / z, px · m, and the step of the disparity, px.
 _FOCAL_BASELINE_PX_M, _DISPARITY_STEP_PX = 580 * 0.075, 0.125
 
-#: Factor of a wrong unit (5000 per metre read as 1000 per metre), and factor of a focal length that is too long.
-_UNIT_FACTOR, _FOCAL_FACTOR = 5.0, 1.1
-
-#: Sideways shift of a rolled map, as a fraction of its width.
-_ROLL_SHARE = 0.1
-
-#: Quantile of depth at which a map is clipped.
-_CLIP_SHARE = 0.6
-
 #: Ratio of two depths from which they belong to different surfaces. Source: chosen, steeper surfaces are not mixed.
 _SIDE_RATIO = 1.2
-
-#: Flying pixels: fraction of the pixels along an outline, one on either side of it, that are mixed, and the least
-#: weight of either side. Source: chosen, a time-of-flight camera without a filter.
-_FLYING_SHARE, _MIN_FLYING_WEIGHT = 0.6, 0.1
-
-#: Edge bleed: fewest and most pixels by which a foreground spreads over its background. Source: chosen, depth maps that
-#: were upsampled by two to six.
-_BLEED_PX = (2, 6)
 
 #: Ghosts: depth below which a sensor returns a false depth, m, and the least and the largest false depth, m.
 #: Source: chosen, minimum ranges of phone LiDARs and depth cameras.
@@ -93,13 +56,13 @@ def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
     field = torch.zeros_like(x + y)
     for _ in range(6):
         across, down, phase = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-        across, down = (_MAX_WARP_WAVES * (2 * u - 1) for u in (across, down))
+        across, down = (2.5 * (2 * u - 1) for u in (across, down))
         field = field + torch.cos(math.pi * (across * x + down * y) + 2 * math.pi * phase)
     field = (field - field.mean()) / field.std().clamp_min(1e-6)
     return depth * (sigma * field).exp()
 
 
-def blur_depth(depth: Tensor, share: float = _BLUR_SIGMA_REL) -> Tensor:
+def blur_depth(depth: Tensor, share: float = 0.012) -> Tensor:
     """The map with edges that mix foreground and background: Gaussian mean of the valid depths around each pixel."""
     sigma_px = max(0.5, share * depth.shape[-1])
     valid = (depth > 0).to(depth)
@@ -107,25 +70,25 @@ def blur_depth(depth: Tensor, share: float = _BLUR_SIGMA_REL) -> Tensor:
     return torch.where(depth > 0, mean[:, 0], 0.0)
 
 
-def move_objects(depth: Tensor, generator: Generator, *, n: int = _N_JUMPS, factor: float = _JUMP_FACTOR) -> Tensor:
+def move_objects(depth: Tensor, generator: Generator, *, n: int = 3, factor: float = 3.0) -> Tensor:
     """The map with ``n`` displaced objects: the pixels around a random pixel, at about its depth, times ``factor``."""
     faulty = depth
     for u, v in _draw_pixels(depth, generator, n):
-        middle = _depth_at(depth, u, v)
-        level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < _JUMP_MAX_LOG_STEP
-        inside = _is_within(depth, u, v, _JUMP_RADIUS_REL) & level & (depth > 0) & (middle > 0)
+        middle = depth[:, v, u][:, None, None]
+        level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < 0.08
+        inside = (_pixel_distance(depth, u, v) < 0.12) & level & (depth > 0) & (middle > 0)
         faulty = torch.where(inside, factor * depth, faulty)
     return faulty
 
 
 def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
     """The map with smoothly invented discs: the blurred surroundings times a smooth factor."""
-    blurred = blur_depth(depth, _DISC_RADIUS_REL)
+    blurred = blur_depth(depth, 0.1)
     faulty = depth
-    for u, v in _draw_pixels(depth, generator, _N_DISCS):
-        off = _MAX_INVENTED_REL * (2 * float(torch.rand((), generator=generator)) - 1)
+    for u, v in _draw_pixels(depth, generator, 4):
+        off = 0.25 * (2 * float(torch.rand((), generator=generator)) - 1)
         x, y = _pixel_grid(depth)
-        r = _pixel_distance(depth, u, v) / _DISC_RADIUS_REL
+        r = _pixel_distance(depth, u, v) / 0.1
         invented = blurred * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
         faulty = torch.where((r < 1) & (depth > 0), invented, faulty)
     return faulty
@@ -144,12 +107,12 @@ def mirror_depth(depth: Tensor) -> Tensor:
     return depth.flip(-1)
 
 
-def roll_depth(depth: Tensor, share: float = _ROLL_SHARE) -> Tensor:
+def roll_depth(depth: Tensor, share: float = 0.1) -> Tensor:
     """The map rolled to the right by the fraction ``share`` of its width."""
     return depth.roll(round(share * depth.shape[-1]), -1)
 
 
-def clip_far_depth(depth: Tensor, nearer: float = _CLIP_SHARE) -> Tensor:
+def clip_far_depth(depth: Tensor, nearer: float = 0.6) -> Tensor:
     """The map clipped at the quantile ``nearer`` of its depths, as by a file format with too few bits."""
     valid = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
     last = (nearer * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
@@ -161,15 +124,14 @@ def mix_outlines(depth: Tensor, generator: Generator) -> Tensor:
     background's depth."""
     share, weight = torch.rand(2, *depth.shape[-2:], generator=generator, dtype=torch.float64).to(depth)
     near, far = _extreme_neighbours(depth)
-    weight = _MIN_FLYING_WEIGHT + (1 - 2 * _MIN_FLYING_WEIGHT) * weight
-    mixed = (depth > 0) & (far > _SIDE_RATIO * near) & (share < _FLYING_SHARE)
+    weight = 0.1 + 0.8 * weight
+    mixed = (depth > 0) & (far > _SIDE_RATIO * near) & (share < 0.6)
     return torch.where(mixed, weight * near + (1 - weight) * far, depth)
 
 
 def bleed_edges(depth: Tensor, generator: Generator, *, foreground: bool = True) -> Tensor:
     """The map with a foreground that spreads over its background by two to six pixels, or the reverse."""
-    low, high = _BLEED_PX
-    for _ in range(int(torch.randint(low, high + 1, (), generator=generator))):
+    for _ in range(int(torch.randint(2, 7, (), generator=generator))):  # of maps that were upsampled by two to six
         near, far = _extreme_neighbours(depth)
         spread = near if foreground else far
         reached = (spread < depth / _SIDE_RATIO) if foreground else (spread > depth * _SIDE_RATIO)
@@ -192,37 +154,32 @@ def _extreme_neighbours(depth: Tensor) -> tuple[Tensor, Tensor]:
     return near, F.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
 
 
-def _deterministic(fault: Callable[[Tensor], Tensor]) -> DepthFault:
-    """A deterministic fault as a :data:`DepthFault`, which ignores the generator."""
-    return lambda depth, _generator: fault(depth)
-
-
 #: Faults of network predictions: of shape and scale, alone and combined.
 NETWORK_FAULTS: dict[str, DepthFault] = {
-    "scale_short": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[0])),
-    "scale_long": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[1])),
-    "shift": _deterministic(partial(shift_depth, shift=_SHIFT_M)),
-    "tilt": _deterministic(partial(tilt_depth, share=_TILT_SHARE, angle=0.6)),
-    "warp_small": lambda depth, g: warp_depth(depth, _WARP_SIGMAS[0], g),
-    "warp_large": lambda depth, g: warp_depth(depth, _WARP_SIGMAS[1], g),
-    "simulated": lambda depth, g: scale_depth(warp_depth(depth, _WARP_SIGMAS[0], g), 1.05),
-    "blur": _deterministic(blur_depth),
+    "scale_short": lambda depth, _: scale_depth(depth, 0.8),
+    "scale_long": lambda depth, _: scale_depth(depth, 1.25),
+    "shift": lambda depth, _: shift_depth(depth, 0.15),
+    "tilt": lambda depth, _: tilt_depth(depth, share=0.1, angle=0.6),
+    "warp_small": lambda depth, g: warp_depth(depth, 0.013, g),
+    "warp_large": lambda depth, g: warp_depth(depth, 0.05, g),
+    "simulated": lambda depth, g: scale_depth(warp_depth(depth, 0.013, g), 1.05),
+    "blur": lambda depth, _: blur_depth(depth),
     "jumps": move_objects,
     "invented": fill_discs,
-    "quantised": _deterministic(quantise_disparity),
+    "quantised": lambda depth, _: quantise_disparity(depth),
 }
 
 #: Faults of sensors and data sets applied to correct maps.
 FILE_FAULTS: dict[str, DepthFault] = {
-    "unit": _deterministic(partial(scale_depth, factor=_UNIT_FACTOR)),
-    "mirrored": _deterministic(mirror_depth),
-    "rolled": _deterministic(roll_depth),
-    "wrong_k": _deterministic(partial(rescale_field_of_view, factor=_FOCAL_FACTOR)),
+    "unit": lambda depth, _: scale_depth(depth, 5.0),
+    "mirrored": lambda depth, _: mirror_depth(depth),
+    "rolled": lambda depth, _: roll_depth(depth),
+    "wrong_k": lambda depth, _: rescale_field_of_view(depth, factor=1.1),
 }
 DEPTH_FAULTS = NETWORK_FAULTS | FILE_FAULTS
 
 #: Faults of file formats that leave only a lower bound of the depth.
-FORMAT_FAULTS: dict[str, DepthFault] = {"cut": _deterministic(clip_far_depth)}
+FORMAT_FAULTS: dict[str, DepthFault] = {"cut": lambda depth, _: clip_far_depth(depth)}
 
 #: Faults of a sensor at single pixels, by the name of their cause in :class:`dhtorch.codes.WrongCause`.
 RETURN_FAULTS: dict[str, DepthFault] = {
@@ -287,12 +244,3 @@ def _pixel_distance(depth: Tensor, u: int, v: int) -> Tensor:
     h, w = depth.shape[-2:]
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) for n in (h, w))
     return ((columns[None] - u).square() + (rows[:, None] - v).square()).sqrt() / w
-
-
-def _is_within(depth: Tensor, u: int, v: int, radius: float) -> Tensor:
-    return _pixel_distance(depth, u, v) < radius
-
-
-def _depth_at(depth: Tensor, u: int, v: int) -> Tensor:
-    """Depth (B, 1, 1) at the pixel (u, v)."""
-    return depth[:, v, u][:, None, None]

@@ -13,10 +13,10 @@ import math
 from functools import lru_cache
 
 import torch
-from torch import Tensor
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
+from dhtorch.pytree import collate
 from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles
 from dhtorch.synthetic.raycast import SURFACE_MOVING, Material, Solid, Triple
 from dhtorch.synthetic.room import furnished_room, make_box
@@ -111,9 +111,8 @@ def move_in_hand(T_world_from_cam: Pose) -> Pose:
         shift = [0.012 * math.sin(0.37 * i), 0.010 * math.sin(0.31 * i + 2.0), 0.010 * math.sin(0.43 * i + 4.0)]
         hand_motions.append(_rotate_about(_CARRIED_CENTRE, turn, shift))
     home_from_viewer = se3.invert(_VIEWER_POSE)
-    return se3.compose(
-        se3.compose(T_world_from_cam, _stack_poses(hand_motions)), _repeat_pose(home_from_viewer, len(hand_motions))
-    )
+    home = home_from_viewer.map(lambda x: x.expand(len(hand_motions), *x.shape[1:]))
+    return se3.compose(se3.compose(T_world_from_cam, collate(hand_motions)), home)
 
 
 def turn_on_turntable(T_world_from_cam: Pose) -> Pose:
@@ -121,7 +120,7 @@ def turn_on_turntable(T_world_from_cam: Pose) -> Pose:
     turntable."""
     axis = se3.apply(_VIEWER_POSE, torch.tensor([[_TURNTABLE_CENTRE]], dtype=torch.float64))[0, 0].tolist()
     n = T_world_from_cam.t.shape[0]
-    return _stack_poses(
+    return collate(
         [
             _rotate_about(tuple(axis), rotation_from_angles(_TURN_DEG_PER_FRAME * i, 0.0, 0.0), [0.0, 0.0, 0.0])
             for i in range(n)
@@ -133,12 +132,3 @@ def _rotate_about(centre: tuple[float, ...], turn: list[list[float]], shift: lis
     """Motion (1): rotation ``turn`` about ``centre``, then translation ``shift``."""
     R, c = torch.tensor([turn], dtype=torch.float64), torch.tensor([centre], dtype=torch.float64)
     return Pose(R, c - se3.rotate(R, c[:, None])[:, 0] + torch.tensor([shift], dtype=torch.float64))
-
-
-def _stack_poses(motions: list[Pose]) -> Pose:
-    parts: list[list[Tensor]] = [[m.R for m in motions], [m.t for m in motions]]
-    return Pose(torch.cat(parts[0]), torch.cat(parts[1]))
-
-
-def _repeat_pose(motion: Pose, n: int) -> Pose:
-    return Pose(motion.R.expand(n, 3, 3), motion.t.expand(n, 3))

@@ -41,7 +41,14 @@ def add_near_card(frame: Frame, T_world_from_card_view: Pose, seed: int) -> tupl
         *(T.map(lambda x: x.double()) for T in (frame.T_world_from_cam, T_world_from_card_view))
     )
     depth, across = _card_in_view(frame.camera, frame.hw, T_card_from_cam)
-    texture = _card_texture(seed).to(across)
+    # Random texture (1, 1, n, n) in [0, 1] with cells of two sizes.
+    generator = Generator().manual_seed(seed)
+    size = 8 * _TEXTURE_CELLS[1]
+    layers = [
+        F.interpolate(torch.rand(1, 1, n, n, generator=generator), (size, size), mode="bilinear")
+        for n in _TEXTURE_CELLS
+    ]
+    texture = (0.5 * (layers[0] + layers[1])).to(across)
     colour = F.grid_sample(texture.expand(len(across), -1, -1, -1), across, mode="bilinear", align_corners=False)
     scale = 255.0 if frame.image.dtype == torch.uint8 else 1.0
     colour = (colour * scale).to(frame.image.dtype).expand(-1, frame.image.shape[1], -1, -1)
@@ -64,17 +71,6 @@ def _card_in_view(camera: cam.Camera, hw: tuple[int, int], T_card_from_cam: Pose
     across = (point - centre)[..., :2] / (0.5 * _CARD_SIDE_M)
     on_card = (z > 0) & (across.abs().amax(-1) < 1)
     return torch.where(on_card, z, 0.0).unflatten(-1, hw), across.unflatten(1, hw)
-
-
-def _card_texture(seed: int) -> Tensor:
-    """Random picture (1, 1, n, n) in [0, 1] with cells of two sizes."""
-    generator = Generator().manual_seed(seed)
-    size = 8 * _TEXTURE_CELLS[1]
-    layers = [
-        F.interpolate(torch.rand(1, 1, n, n, generator=generator), (size, size), mode="bilinear")
-        for n in _TEXTURE_CELLS
-    ]
-    return 0.5 * (layers[0] + layers[1])
 
 
 def card_over_map(depth_map: Tensor, card_depth: Tensor) -> Tensor:

@@ -55,7 +55,18 @@ _BOOK_COLOURS: tuple[Triple, ...] = (
 def furnished_room(seed: int = 2) -> ShadedRoom:
     """The furnished room of a seed, shaded; cached for the last two seeds."""
     draw = Random(seed)
-    solids = [_shell(draw)]
+    size = (ROOM_RIGHT_M - ROOM_LEFT_M, _ROOM_HEIGHT_M, ROOM_BACK_M - ROOM_FRONT_M)
+    faces = {
+        _FACE_TOP: Material("plaster", (0.97, 0.96, 0.93), 2.0),
+        _FACE_BOTTOM: Material("planks", tile=1.3),
+        _FACE_POS_Z: Material("brick", tile=2.0),
+        _FACE_NEG_Z: Material("wallpaper", tile=1.6),
+        _FACE_NEG_X: _BLANK_WALL,
+        _FACE_POS_X: _BLANK_WALL,
+    }
+    solids = [
+        make_box((ROOM_LEFT_M + ROOM_RIGHT_M) / 2, 0, (ROOM_BACK_M + ROOM_FRONT_M) / 2, size, _BLANK_WALL, faces=faces)
+    ]
     for part in (_divider, _on_the_divider, _seats, _back_wall, _side_walls):
         solids += part(draw)
     window = Light(
@@ -95,28 +106,6 @@ def make_box(
 def make_ball(x: float, height: float, z: float, radius: float, surface: Material, **more: object) -> Solid:
     """A ball resting ``height`` above the floor."""
     return Solid((x, -height - radius, z), (radius, radius, radius), surface, ball=True, **more)  # type: ignore[arg-type]
-
-
-def _tint(draw: Random) -> Triple:
-    """Random tint of a book cover: a muted warm, cool or grey colour."""
-    base = draw.choice(_BOOK_COLOURS)
-    tone = draw.uniform(0.75, 1.2)
-    return (base[0] * tone, base[1] * tone, base[2] * tone)
-
-
-def _shell(draw: Random) -> Solid:
-    size = (ROOM_RIGHT_M - ROOM_LEFT_M, _ROOM_HEIGHT_M, ROOM_BACK_M - ROOM_FRONT_M)
-    faces = {
-        _FACE_TOP: Material("plaster", (0.97, 0.96, 0.93), 2.0),
-        _FACE_BOTTOM: Material("planks", tile=1.3),
-        _FACE_POS_Z: Material("brick", tile=2.0),
-        _FACE_NEG_Z: Material("wallpaper", tile=1.6),
-        _FACE_NEG_X: _BLANK_WALL,
-        _FACE_POS_X: _BLANK_WALL,
-    }
-    return make_box(
-        (ROOM_LEFT_M + ROOM_RIGHT_M) / 2, 0, (ROOM_BACK_M + ROOM_FRONT_M) / 2, size, _BLANK_WALL, faces=faces
-    )
 
 
 def _legs(x: float, z: float, size: Triple, thick: float, surface: Material, yaw: float = 0) -> list[Solid]:
@@ -282,7 +271,9 @@ def _books(draw: Random, left: float, right: float, height: float, z: float, *, 
         depth = draw.uniform(0.16, 0.24)
         if x + width > stop:
             return books
-        surface = Material("spine", _tint(draw))
+        base = draw.choice(_BOOK_COLOURS)
+        tone = draw.uniform(0.75, 1.2)
+        surface = Material("spine", (base[0] * tone, base[1] * tone, base[2] * tone))
         books.append(
             make_box(
                 x + width / 2,

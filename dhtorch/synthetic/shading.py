@@ -56,7 +56,19 @@ class ShadedRoom:
         self._reflect = torch.tensor([s.reflect for s in surfaces])
         self._glow = torch.tensor([s.glow for s in surfaces])
         self._tint = torch.tensor([s.tint for s in surfaces])
-        self._scale = _texture_scale(solids, surfaces)
+        # (faces, 3): texels per half width across and down, signed so that print is not mirrored; texels per m.
+        rows = []
+        for f, surface in enumerate(surfaces):
+            solid, axis, positive = solids[f // 6], (f % 6) // 2, f % 2
+            half = [solid.half[k] for k in ((2, 1), (0, 2), (0, 1))[axis]]
+            per_m = [TEXTURE_SIZE_PX / (surface.tile or 2 * h) for h in half]
+            # Seen from outside, x runs left on the far (+z) face and z runs left on the near (-x) one; inside, the
+            # reverse.
+            flip = (axis == 0 and not positive) or (axis == 2 and bool(positive))
+            across = -1 if axis != 1 and flip == (f >= 6) else 1
+            down = -1 if axis == 1 and not positive else 1
+            rows.append([across * half[0] * per_m[0], down * half[1] * per_m[1], (per_m[0] * per_m[1]) ** 0.5])
+        self._scale = torch.tensor(rows)
         #: Mean grey of each face (faces,), display values: its brightness to an active sensor.
         self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA_WEIGHTS)).sum(-1)
         self.light = _Lightmap(self.solids, self._lights, self._ambient, lit)
@@ -180,7 +192,9 @@ class _Pictures:
 
     def sample(self, picture: Tensor, x: Tensor, y: Tensor, width: Tensor) -> Tensor:
         """Trilinear look-up (P, 3) at texel coordinates from the picture's middle, averaged over ``width`` texels."""
-        level = _log2(width).clamp(0, len(self._levels) - 1.001)
+        # log2 to within 0.09, linear between powers of two: from the exponent bits of a float32.
+        log2 = width.clamp(min=1e-6).view(torch.int32).float() * 2.0**-23 - 127
+        level = log2.clamp(0, len(self._levels) - 1.001)
         finer = level.floor().long()
         near, far = (self._bilinear(picture * self._texels_each, finer + k, x, y) for k in (0, 1))
         return near + (far - near) * (level - finer)[:, None]
@@ -312,23 +326,3 @@ def _sphere_directions(n: int = 14) -> list[Triple]:
 def _face_materials(solids: Sequence[Solid]) -> list[Material]:
     """Material of every face, six per solid."""
     return [s.faces.get(f, s.surface) for s in solids for f in range(6)]
-
-
-def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Material]) -> Tensor:
-    """(faces, 3): texels per half width across and down, signed so that print is not mirrored; texels per m."""
-    rows = []
-    for f, surface in enumerate(surfaces):
-        solid, axis, positive = solids[f // 6], (f % 6) // 2, f % 2
-        half = [solid.half[k] for k in ((2, 1), (0, 2), (0, 1))[axis]]
-        per_m = [TEXTURE_SIZE_PX / (surface.tile or 2 * h) for h in half]
-        # Seen from outside, x runs left on the far (+z) face and z runs left on the near (-x) one; inside, the reverse.
-        flip = (axis == 0 and not positive) or (axis == 2 and bool(positive))
-        across = -1 if axis != 1 and flip == (f >= 6) else 1
-        down = -1 if axis == 1 and not positive else 1
-        rows.append([across * half[0] * per_m[0], down * half[1] * per_m[1], (per_m[0] * per_m[1]) ** 0.5])
-    return torch.tensor(rows)
-
-
-def _log2(x: Tensor) -> Tensor:
-    """log2 to within 0.09, linear between powers of two: from the exponent bits of a float32."""
-    return x.clamp(min=1e-6).view(torch.int32).float() * 2.0**-23 - 127

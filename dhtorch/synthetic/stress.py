@@ -160,27 +160,25 @@ class StressRoom(SyntheticRoom):
 
     def _picture(self, i: int) -> Tensor:
         if self.stress == "motion_blur":
-            return self._smeared(i)
+            # Motion-blurred image: mean of renderings at most a pixel apart, on both sides of the
+            # frame's pose
+            right, down = self.smear(i)
+            n = math.ceil(math.hypot(right, down)) + 1
+            pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
+            total = torch.zeros(1, 3, *self.hw)
+            for k in range(n):
+                offset = (k / (n - 1) - 0.5) / f  # turning the camera left and up shifts the image right and down
+                turn = torch.tensor(
+                    [rotation_from_angles(-math.degrees(right * offset), math.degrees(down * offset), 0.0)],
+                    dtype=torch.float64,
+                )
+                total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
+            return total / n
         if self.turn is not None:
             return self._turned(i)
         if not self.bands:
             return self._photograph(i, self.camera, self.true_poses[i : i + 1], self.hw, exposure=self.gain(i))
         return torch.cat([self._photograph(i, camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
-
-    def _smeared(self, i: int) -> Tensor:
-        """Motion-blurred image: mean of renderings at most a pixel apart, on both sides of the frame's pose."""
-        right, down = self.smear(i)
-        n = math.ceil(math.hypot(right, down)) + 1
-        pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
-        total = torch.zeros(1, 3, *self.hw)
-        for k in range(n):
-            offset = (k / (n - 1) - 0.5) / f  # turning the camera left and up shifts the image right and down
-            turn = torch.tensor(
-                [rotation_from_angles(-math.degrees(right * offset), math.degrees(down * offset), 0.0)],
-                dtype=torch.float64,
-            )
-            total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
-        return total / n
 
     def _turned(self, i: int) -> Tensor:
         """Image under a rolling shutter with motion blur: bands of rows, each the mean over its exposure."""

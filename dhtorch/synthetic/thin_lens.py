@@ -80,7 +80,8 @@ def _render_scene(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, s
     margin = math.ceil(widest / 2) + 2
     size = (light.shape[-2] + 2 * margin, light.shape[-1] + 2 * margin)
     position = (high - inverse) / max(high - low, 1e-12) * (count - 1)
-    radius = _frequencies(size, light)
+    v, u = torch.fft.fftfreq(size[0], dtype=light.dtype), torch.fft.rfftfreq(size[1], dtype=light.dtype)
+    radius = (v[:, None] ** 2 + u**2).sqrt()
     total = light.new_zeros(len(focus), light.shape[0], *size)
     cover = light.new_zeros(len(focus), 1, *size)
     solid = torch.cat((light, torch.ones_like(light[:1])))
@@ -99,12 +100,6 @@ def _render_scene(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, s
         cover = cover + visible
     image = total / cover.clamp_min(_MIN_COVER)
     return image[..., margin:-margin, margin:-margin]
-
-
-def _frequencies(size: tuple[int, int], like: Tensor) -> Tensor:
-    """Frequencies (H, W // 2 + 1) of the real Fourier transform, cycles per pixel."""
-    v, u = torch.fft.fftfreq(size[0], dtype=like.dtype), torch.fft.rfftfreq(size[1], dtype=like.dtype)
-    return (v[:, None] ** 2 + u**2).sqrt()
 
 
 def _disc_transfer(radius: Tensor, diameter: float) -> Tensor:
