@@ -164,7 +164,8 @@ class MapRowDataset(RowDataset):
         reason = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
         for name in maps:
             if MAP_FILES[name].enrich == "tiff":
-                step, x = self.step / MAP_STEPS.get(name, 1), maps[name].astype(np.float64)
+                step = self.step / MAP_STEPS.get(name, 1)
+                x = maps[name].astype(np.float64)
                 # At least one step where positive; 0 = unquantised.
                 x = np.where(x > 0, np.rint(x / step).clip(1) * step, 0) if step else x
                 maps[name] = x.astype(np.float32)

@@ -123,7 +123,8 @@ class LeRobotSource(DatasetSource):
         with doors.restrict_links(bounds):
             meta = read_lerobot_meta(root)
             info = files.read_json(root / "meta" / "info.json")
-            episodes, tasks = read_lerobot_episodes(meta, numbers), tuple(_read_tasks(meta))
+            episodes = read_lerobot_episodes(meta, numbers)
+            tasks = tuple(_read_tasks(meta))
         return cls(
             meta=meta,
             info=info,

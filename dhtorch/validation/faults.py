@@ -395,7 +395,8 @@ class FaultWindow:
         if not bool((ratios > 0).any()):
             return hypotheses
         # A unit must be possible at the median ratio of near returns to the maps.
-        ratio, limit = float(ratios[ratios > 0].median()), math.log(self.options.max_unit_misfit)
+        ratio = float(ratios[ratios > 0].median())
+        limit = math.log(self.options.max_unit_misfit)
         units = {name for name, factor in UNIT_FACTORS.items() if not abs(math.log(ratio / factor)) < limit}
         return [cause for cause in hypotheses if cause.name not in units]
 

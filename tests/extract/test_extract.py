@@ -25,7 +25,7 @@ from dhtorch.cli.run import main
 from dhtorch.extract import FeatureTable, JoinedDataset, engines
 from dhtorch.geometry import camera as cam
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleProblem
+from dhtorch.transforms import ExtendDepth, ExtendedDataset
 
 HW, GAP, N, NEAR = (72, 96), 2, 128, 2.5
 LENGTHS = (5, 4, 3)
@@ -219,26 +219,6 @@ def test_a_corrupt_frame_raises_in_one_line(damaged, command):
     assert all(word in err for word in ("frame 3", "00003.png", "expected", "extract.on_error=skip")), err
     assert [p.name for p in files("features")] == ["shard-00000.parquet"], "what was whole before it stays"
     assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]
-
-
-@pytest.mark.parametrize("on_error", [pytest.param("skip", marks=pytest.mark.slow), "flag"])
-def test_a_corrupt_frame_is_skipped_or_flagged_with_zeros_and_counted(on_error, damaged, command):
-    args = [*damaged, f"extract.on_error={on_error}", "workers=1"]
-    code, out, err = command(*args)
-    assert code == 0 and not without_notes(err), err
-    name, kept = ("1 skipped", [0, 1, 2, 4, 5, 6, 7]) if on_error == "skip" else ("1 unreadable", list(range(8)))
-    assert f"{len(kept)} rows" in out and name in out and "00003.png" in out
-    assert "3 no second view" in out, "the two first, and the one whose other view cannot be read"
-    features = FeatureTable("features")
-    assert features.place["frame_index"].tolist() == kept and np.isnan(features.place["timestamp"]).all()
-    assert [int(row["dhtorch.problem"]) for row in features] == [
-        {2: 0, 3: 3, 4: 0}.get(k, int(k in (0, 1, 5))) for k in kept
-    ]
-    if on_error == "flag":
-        row = features.at(0, 3)
-        assert int(row.pop("dhtorch.problem")) == SampleProblem.UNREADABLE and all(not x.any() for x in row.values())
-    code, out, _ = command(*args)
-    assert f"(3 left untouched), {len(kept)} rows" in out and name in out, "counts are kept with the shards"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Every number of an enriched set stands in the row of its own frame and camera: rows, tables and folders of few pixels."""
 
-import json
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from support.stub_recordings import Load, frame, recording
-from support.stub_samples import FixedEstimate, H, N, Stub, W
+from support.stub_samples import FixedEstimate, N, Stub
 
 pytest.importorskip("pyarrow")
 import pyarrow as pa
@@ -19,11 +17,9 @@ from dhtorch.data.io.decode import decode_image
 from dhtorch.extract import plan
 from dhtorch.extract.engines import filter_rows
 from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, map_columns
-from dhtorch.extract.nerf_target import NerfstudioTarget
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.shards import write_shard
 from dhtorch.extract.step_set import RldsSource
-from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
 
@@ -43,7 +39,7 @@ def moving(first, name, n=M, **options):
 
 
 def written_cameras(folder, scenes, views, on_error="raise"):
-    """Rows of two cameras of one episode as a worker returns them, and their shards by camera."""
+    """Shards by camera of two cameras of one episode."""
     whole, wanted = plan.make_plan(scenes, 1, 1, rigs=True), map_columns(pictures=True, n=N)
     method = Stub(answer=FixedEstimate(), n=N)
     rows = MapRowDataset(scenes, whole, wanted, method=method, gap=1, step=2**-10, views=views)
@@ -52,86 +48,31 @@ def written_cameras(folder, scenes, views, on_error="raise"):
         shard = plan.ShardSpec(first, 8, range(first, first + M))
         write_shard(folder, shard, filter_rows(answers[first : first + M], on_error, rows, []), wanted, SHARED)
         parts[key] = [folder / shard.name]
-    return answers, parts
-
-
-@pytest.fixture(scope="module")
-def two_cameras(tmp_path_factory):
-    scenes = [moving(0, "left"), moving(40, "right")]
-    views = {view.key: view for view in (DatasetCamera.of(scene, 64) for scene in scenes)}
-    rows, parts = written_cameras(tmp_path_factory.mktemp("shards"), scenes, views)
-    assert not [row.complaint for row in rows if row.complaint]
-    return SimpleNamespace(scenes=scenes, views=views, rows=rows, parts=parts)
-
-
-def test_a_row_is_that_of_its_own_frame(two_cameras):
-    for n, row in enumerate(two_cameras.rows):
-        scene, i = two_cameras.scenes[n // M], n % M
-        recorded, columns = scene.recording, row.features
-        assert row.place["recording"] == scene.name and row.place["frame_index"] == i
-        assert row.place["timestamp"] == float(recorded.times[i])
-        expected = se3.to_matrix(recorded.poses[i : i + 1])[0].flatten().numpy()
-        assert np.array_equal(columns["pose"], expected)
-        own = frame(40 * (n // M) + i)
-        assert np.allclose(columns["K"], cam.to_matrix(own.camera)[0].double().flatten())
-        assert np.array_equal(decode_image(columns["picture"], "a row"), own.image[0].numpy())
-
-
-def lerobot(folder, views, **options):
-    plain = {"origin": None, "numbers": [7, 8], "step": 2**-10, "maps": ("depth", "sigma", "source"), "fps": 5.0}
-    return LeRobotTarget(folder, 3, views, **{**plain, "as_images": False, "task": None, "key": "k", "n": N, **options})
-
-
-def test_a_table_of_two_cameras_holds_what_each_of_them_saw_and_counts_on(two_cameras, tmp_path):
-    target = lerobot(tmp_path, two_cameras.views)
-    first = target.assemble(0, [], two_cameras.parts)
-    second = target.assemble(1, [first], two_cameras.parts)
-    assert (first["start"], first["length"], second["start"], second["length"]) == (0, M, M, M)
-    for k, start in enumerate((0, M)):
-        table = parquet.read_table(target.file(k)).to_pydict()
-        assert table["index"] == list(range(start, start + M)) and table["frame_index"] == list(range(M))
-        assert table["episode_index"] == [k] * M and table["task_index"] == [0] * M
-        assert np.allclose(table["timestamp"], np.arange(M) / 5)
-        assert table["observation.time"] == [0.25 * i for i in range(M)]
-        assert table["observation.frame_number"] == list(range(M))
-        for n, name in enumerate(("left", "right")):
-            images = [decode_image(cell["bytes"], "a cell") for cell in table[f"observation.images.{name}"]]
-            for i, image in enumerate(images):
-                own = two_cameras.rows[M * n + i].features
-                assert np.array_equal(image, frame(40 * n + i).image[0].numpy()), (name, i)
-                assert np.array_equal(table[f"observation.{name}.T_world_from_cam"][i], own["pose"])
-                assert np.array_equal(table[f"observation.{name}.intrinsics"][i], own["K"])
+    return parts
 
 
 @pytest.mark.parametrize("on_error", ["flag", "skip"])
-def test_an_instant_with_an_unreadable_frame_takes_no_row(on_error, two_cameras, tmp_path):
-    broken = [moving(0, "left", bad={1}), moving(40, "right")]
-    _, parts = written_cameras(tmp_path, broken, two_cameras.views, on_error)
-    target = lerobot(tmp_path / "out", two_cameras.views)
-    assert target.assemble(0, [], parts)["length"] == M - 1
-    table = parquet.read_table(target.file(0)).to_pydict()
-    assert table["observation.frame_number"] == [0, *range(2, M)] and table["frame_index"] == list(range(M - 1))
-    for cell, i in zip(table["observation.images.right"], (0, *range(2, M)), strict=True):
-        assert np.array_equal(decode_image(cell["bytes"], "a cell"), frame(40 + i).image[0].numpy())
-
-
-@pytest.mark.parametrize("lens", [(), (0.11, -0.05, 0.003, -0.002, 0.01)])
-def test_a_nerfstudio_folder_states_the_lens_and_the_pose_of_every_picture(two_cameras, tmp_path, lens):
-    (key, view), *_ = two_cameras.views.items()
-    target = NerfstudioTarget(tmp_path, {key: replace(view, lens=lens)}, [{key: ""}], "k")
-    target.assemble(0, [], two_cameras.parts)
-    shots = json.loads((tmp_path / "transforms.json").read_text())["frames"]
-    assert [shot["timestamp"] for shot in shots] == [0.25 * i for i in range(M)]
-    for i, shot in enumerate(shots):
-        own = two_cameras.rows[i].features
-        assert tuple(shot.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")) == (lens or (0.0,) * 5)
-        expected = own["pose"].reshape(4, 4) @ np.diag([1, -1, -1, 1])
-        assert np.allclose(shot["transform_matrix"], expected)
-        assert np.allclose((shot["fl_x"], shot["fl_y"]), own["K"][[0, 4]])
-        assert np.allclose((shot["cx"], shot["cy"]), own["K"][[2, 5]] + 0.5)
-        assert (shot["w"], shot["h"]) == (W, H)
-        picture = decode_image((tmp_path / shot["file_path"]).read_bytes(), "a file")
-        assert np.array_equal(picture, frame(i).image[0].numpy())
+def test_an_instant_with_an_unreadable_frame_takes_no_row(on_error, tmp_path):
+    scenes = [moving(0, "left", bad={1}), moving(40, "right")]
+    views = {view.key: view for view in (DatasetCamera.of(scene, 64) for scene in scenes)}
+    parts = written_cameras(tmp_path, scenes, views, on_error)
+    plain = {"origin": None, "numbers": [7, 8], "step": 2**-10, "maps": ("depth", "sigma", "source"), "fps": 5.0}
+    target = LeRobotTarget(tmp_path / "out", 3, views, **plain, as_images=False, task=None, key="k", n=N)
+    first = target.assemble(0, [], parts)
+    second = target.assemble(1, [first], parts)
+    assert (first["start"], first["length"], second["start"], second["length"]) == (0, M - 1, M - 1, M - 1)
+    kept = [0, *range(2, M)]
+    for k in range(2):
+        table = parquet.read_table(target.file(k)).to_pydict()
+        assert table["index"] == [k * (M - 1) + i for i in range(M - 1)] and table["episode_index"] == [k] * (M - 1)
+        assert table["observation.frame_number"] == kept and table["frame_index"] == list(range(M - 1))
+        assert table["observation.time"] == [0.25 * i for i in kept]
+        assert np.allclose(table["timestamp"], np.arange(M - 1) / 5)
+        for cell, pose, i in zip(
+            table["observation.images.right"], table["observation.right.T_world_from_cam"], kept, strict=True
+        ):
+            assert np.array_equal(decode_image(cell["bytes"], "a cell"), frame(40 + i).image[0].numpy())
+            assert np.array_equal(pose, se3.to_matrix(scenes[1].recording.poses[i : i + 1])[0].flatten())
 
 
 class Steps:
