@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from dhtorch.alignment import align
 from dhtorch.alignment.map_family import MAP_FAMILIES
 from dhtorch.cli import complete
 from dhtorch.cli import completed_folder as completed
-from dhtorch.cli.completed_folder import CompletionTask, select_layout
+from dhtorch.cli.completed_folder import CompletionTask, Row, select_layout
 from dhtorch.cli.option_checks import validate_choices
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.data import depth_maps
@@ -35,12 +35,9 @@ from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.viz.plots import draw_aligned
 from dhtorch.viz.viewer import validation as pages
-
-Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
-Row = dict[str, Any]
 
 #: Names that ``fail_on`` accepts → the quantity compared with the limit, over a whole recording.
 _ALIGNMENT_LIMITS = {
@@ -287,10 +284,15 @@ def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exc
     frames = []
     for i in order:
         row = task.done[task.name(i)]
-        cells = [_format_cell(row["aligned"][k]) for k in ("model", "scale", "sigma", "no_answer", "near", "far")]
-        frames.append(
-            pages.ValidatedFrame(f"frame {row['frame']}", cells, _render_frame(task, maps, i) if i in shown else None)
-        )
+        values = [row["aligned"][k] for k in ("model", "scale", "sigma", "no_answer", "near", "far")]
+        cells = ["–" if x is None else f"{x:.3f}" if isinstance(x, float) else str(x) for x in values]
+        image = None
+        if i in shown:  # the figure of a frame, from its written files
+            out, aligned = io.BytesIO(), completed.read_completed_maps(task, i)[0]
+            title = f"{task.scene.name} {task.name(i)}"
+            draw_aligned(out, task.recording[i].image[0], maps[i], **aligned, title=title)
+            image = out.getvalue()
+        frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, image))
     failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
     place, table = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
     return pages.write_validation_page(place, task.scene.name, sentences=lines, word="align", note=_PAGE_NOTE, **table)
@@ -299,15 +301,3 @@ def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exc
 def _severity(row: Row) -> float:
     """Sort key of the frames: unanswered fraction plus sigma / depth."""
     return float(row["no_answer"]) + (1.0 if row["sigma"] is None else float(row["sigma"]))
-
-
-def _format_cell(value: Any) -> str:
-    return "–" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
-
-
-def _render_frame(task: CompletionTask, maps: DepthMaps, i: int) -> bytes:
-    """The figure of a frame from its written files, as PNG."""
-    out, depth_map = io.BytesIO(), maps[i]
-    aligned, _ = completed.read_completed_maps(task, i)
-    draw_aligned(out, task.recording[i].image[0], depth_map, **aligned, title=f"{task.scene.name} {task.name(i)}")
-    return out.getvalue()

@@ -20,10 +20,10 @@ from dhtorch.runtime.console import format_count, get_verbosity
 from dhtorch.validation.capture_check import CaptureCheck, check_capture
 
 #: Recordings of one data set that are checked: episodes of a set are written by one program. Limits the time at the
-#: start of a command to some seconds. Source: origin not recorded.
+#: start of a command to some seconds.
 _MAX_CHECKED_RECORDINGS = 12
 
-#: Frames of a recording that are examined for depth. Limits the time. Source: origin not recorded.
+#: Frames of a recording that are examined for depth. Limits the time.
 _MAX_EXAMINED_FRAMES = 4
 
 

@@ -633,21 +633,15 @@ def to_overrides(
                 raise ValueError(f"{flag}: found no value, expected {flag} VALUE")
             value = words.pop(0) if has_value else "true"
         out.append(f"{full}={value}")
-    return [word if word.startswith("-") else _with_full_name(name, word, known) for word in out]
-
-
-def _bracket_list(value: str, note: OptionNote) -> str:
-    """A comma-separated value in brackets where the default is a list."""
-    is_list = note.default.startswith("[") or note.note.startswith("list ")
-    return f"[{value}]" if is_list and not value.startswith(("[", "null")) else value
-
-
-def _with_full_name(name: str, word: str, known: Mapping[str, OptionNote]) -> str:
-    """``option=value`` with the option's dotted name; other arguments unchanged."""
-    option, sign, value = word.partition("=")
-    is_name = bool(sign) and re.fullmatch(r"[\w.-]+", option) is not None
-    full = resolve_option(name, option, known) if is_name else None
-    return word if full is None else f"{full}={_bracket_list(value, known[full])}"
+    for k, word in enumerate(out):
+        # ``option=value`` with the option's dotted name, and in brackets where the default is a list
+        option, sign, value = word.partition("=")
+        is_name = bool(sign) and re.fullmatch(r"\w[\w.-]*", option) is not None
+        if is_name and (full := resolve_option(name, option, known)) is not None:
+            default, note = known[full]
+            is_list = default.startswith("[") or note.startswith("list ")
+            out[k] = f"{full}=[{value}]" if is_list and not value.startswith(("[", "null")) else f"{full}={value}"
+    return out
 
 
 def to_parser_arguments(argv: Iterable[str], known: Iterable[str]) -> list[str]:

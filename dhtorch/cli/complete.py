@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,9 @@ from dhtorch.pipeline.view_report import report_selection, with_view_selection
 from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import is_whole, open_output_folder
 from dhtorch.viz.plots import draw_completed
-
-Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")

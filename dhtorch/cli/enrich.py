@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import errno
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
@@ -35,11 +35,10 @@ from dhtorch.pipeline import dense
 from dhtorch.pipeline.presets import with_sensor
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, OutputFolder, open_output_folder
 from dhtorch.transforms import poses
 
-Progress = Callable[..., Iterable[Any]]
 Row = dict[str, Any]
 
 #: Version of the file format; increased when older readers would misread the files.
@@ -175,7 +174,11 @@ def _write_missing_episodes(
 
 
 def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJob:
-    scenes = _subsample(scenes_of(parts["data"]), settings)
+    scenes = scenes_of(parts["data"])
+    if settings["every"] > 1 and scenes[0].recording.format in ("lerobot", "rlds"):
+        kept = f"with a {scenes[0].recording.format} set, all of whose rows are kept"
+        raise ValueError(f"every: found {settings['every']} {kept}; expected 1 (max_frames=N limits them)")
+    scenes = cut.subsample_scenes(scenes, settings["every"], settings["max_frames"])
     method = with_sensor(parts["method"], settings["sensor"])
     whole = plan.make_plan(scenes, settings["gap"], method.views, rigs=True)
     out = Path(str(settings["out"])).expanduser()
@@ -217,16 +220,6 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     return EnrichJob(
         out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows, notes=notes
     )
-
-
-def _subsample(scenes: Sequence[Scene], settings: Mapping[str, Any]) -> Sequence[Scene]:
-    """The scenes with their wanted frames; raises ValueError for ``every`` with a data set, whose rows are all kept."""
-    if settings["every"] > 1 and scenes[0].recording.format in ("lerobot", "rlds"):
-        raise ValueError(
-            f"every: found {settings['every']} with a {scenes[0].recording.format} set, all of whose rows are kept; "
-            "expected 1 (max_frames=N limits them)"
-        )
-    return cut.subsample_scenes(scenes, settings["every"], settings["max_frames"])
 
 
 def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, DatasetCamera]) -> None:

@@ -8,6 +8,7 @@ first. An interrupted download goes on where it stopped; nothing gets its name b
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import http.client
 import json
@@ -143,7 +144,12 @@ def _contents(scene: FetchedScene, names: Sequence[str], parts: Path, max_bytes:
             file.unlink()
     elif names:
         file = download(scene.archive, parts, scene.archive_sha256, max_bytes)
-        with _open_archive(file, scene.archive) as archive:
+        try:
+            opened = zipfile.ZipFile(file) if zipfile.is_zipfile(file) else tarfile.open(file)  # noqa: SIM115
+        except (tarfile.TarError, EOFError, OSError) as error:
+            file.unlink()
+            raise ValueError(f"{scene.archive}: found no tar or zip archive ({error})") from None
+        with opened as archive:
             for name in names:
                 content = _read_member(archive, scene.inside + name, scene.archive, max_bytes)
                 yield name, _finish(scene, name, content, f"{scene.archive}, {scene.inside}{name}")
@@ -165,15 +171,12 @@ def _cut(content: bytes, cut: Mapping[str, list[float]]) -> bytes:
         first, last = cut["rows"]
         return b"".join(lines[int(first) : int(last) + 1])
     low, high = cut["times"]
-    return b"".join(line for line in lines if line.startswith(b"#") or low <= _first_number(line) <= high)
-
-
-def _first_number(line: bytes) -> float:
-    """First number of a line; NaN where there is none, which no span of times contains."""
-    try:
-        return float(line.split()[0])
-    except (IndexError, ValueError):
-        return float("nan")
+    kept = []
+    for line in lines:
+        with contextlib.suppress(IndexError, ValueError):  # a line without a number is in no span of times
+            if line.startswith(b"#") or low <= float(line.split()[0]) <= high:
+                kept.append(line)
+    return b"".join(kept)
 
 
 def download(address: str, folder: Path, digest: str | None, max_bytes: int = MAX_BYTES) -> Path:
@@ -225,14 +228,6 @@ def _open_address(address: str, start: int) -> Any:
         if start and error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             return _open_address(address, 0)
         raise
-
-
-def _open_archive(file: Path, address: str) -> tarfile.TarFile | zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(file) if zipfile.is_zipfile(file) else tarfile.open(file)
-    except (tarfile.TarError, EOFError, OSError) as error:
-        file.unlink()
-        raise ValueError(f"{address}: found no tar or zip archive ({error})") from None
 
 
 def _read_member(archive: tarfile.TarFile | zipfile.ZipFile, name: str, address: str, max_bytes: int) -> bytes:

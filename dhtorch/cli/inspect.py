@@ -236,16 +236,14 @@ def _parse_reader_options(arguments: Sequence[str]) -> dict[str, Any]:
         name, sign, text = argument.partition("=")
         if not (sign and name.startswith("data.") and name.removeprefix("data.").isidentifier()):
             raise ValueError(f"{argument}: found an unknown argument, expected data.NAME=VALUE, e.g. data.fov=69")
-        items = [_parse_value(item.strip()) for item in text.removeprefix("[").removesuffix("]").split(",")]
+        items: list[Any] = [item.strip() for item in text.removeprefix("[").removesuffix("]").split(",")]
+        for k, item in enumerate(items):
+            items[k] = {"true": True, "false": False, "null": None}.get(item.lower(), item)
+            for kind in (float, int):
+                with contextlib.suppress(ValueError):
+                    items[k] = kind(item)
         options[name.removeprefix("data.")] = items if text.startswith("[") or len(items) > 1 else items[0]
     return options
-
-
-def _parse_value(text: str) -> Any:
-    for kind in (int, float):
-        with contextlib.suppress(ValueError):
-            return kind(text)
-    return {"true": True, "false": False, "null": None}.get(text.lower(), text)
 
 
 # -------------------------------------------------------------------------------------------------------------- search

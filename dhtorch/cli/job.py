@@ -104,62 +104,46 @@ def run(
             return JobStatus(str(folder), "untouched")
         output.check_folders([folder / _SCENES_FOLDER, *(folder / data_set.name for data_set in data_sets)])
         output.check([target, folder / DATA_ROOT_FILE])
-        return _write_result(settings, parts, names, (target, key, digest, code), data_sets, progress, swept=swept)
-
-
-def _write_result(
-    settings: Mapping[str, Any],
-    parts: Mapping[str, Any],
-    names: Mapping[str, str],
-    place: tuple[Path, str, str, str],  # result file, key, digests of the data and of the code
-    data_sets: Sequence[Scene] | Sequence[FocalStacks],
-    progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
-    *,
-    swept: bool,
-) -> JobStatus:
-    """Run the experiment and write its files."""
-    target, key, digest, code = place
-    folder = target.parent
-    methods = {names["method"]: parts["method"]}
-    # The key of the scenes: that of the result, and the machine and libraries on which their last bits depend
-    meta = {k: v for k, v in _collect_metadata(settings).items() if k not in ("utc", "git")}
-    finished = FinishedScenes(
-        folder / _SCENES_FOLDER, hashlib.sha256(repr((key, meta)).encode()).hexdigest(), reuse=settings["resume"]
-    )
-    pair_settings = Settings(
-        cutoff=settings["holdout"]["cutoff"],
-        truth=(settings["holdout"]["truth"],),
-        dtype=getattr(torch, settings["dtype"]),
-        finished=finished,
-        **{name: settings[name] for name in ("seed", "device", "batch", "workers", "between")},
-    )
-    outcome = parts["experiment"](data_sets, methods, parts["pairs"], pair_settings, progress=progress)
-    _LOG.debug("%d pairs answered", outcome.n_pairs)
-    examples = outcome.examples if settings["figures"] else []
-    drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
-    scenes = [data_set.name for data_set in data_sets]
-    data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
-    result = result_files.build_result(
-        experiment=names["experiment"],
-        key=key,
-        meta={**_collect_metadata(settings), "code": code},
-        config=settings,
-        data=data,
-        summary=outcome.summary,
-        rows=outcome.rows,
-        question=outcome.question,
-        expectation=outcome.expectation,
-        verdict=outcome.verdict,
-        why=outcome.why,
-        metrics=[asdict(metric) for metric in outcome.metrics],
-    )
-    root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
-    if root is not None:
-        storage.replace_file(folder / DATA_ROOT_FILE, f"{Path(root).resolve()}\n".encode())
-    result_files.write_result(target, result)
-    finished.remove()
-    _print_result(result, [target, *drawn], swept=swept)
-    return JobStatus(str(folder), "finished")
+        methods = {names["method"]: parts["method"]}
+        # The key of the scenes: that of the result, and the machine and libraries on which their last bits depend
+        meta = {k: v for k, v in _collect_metadata(settings).items() if k not in ("utc", "git")}
+        finished = FinishedScenes(
+            folder / _SCENES_FOLDER, hashlib.sha256(repr((key, meta)).encode()).hexdigest(), reuse=settings["resume"]
+        )
+        pair_settings = Settings(
+            cutoff=settings["holdout"]["cutoff"],
+            truth=(settings["holdout"]["truth"],),
+            dtype=getattr(torch, settings["dtype"]),
+            finished=finished,
+            **{name: settings[name] for name in ("seed", "device", "batch", "workers", "between")},
+        )
+        outcome = parts["experiment"](data_sets, methods, parts["pairs"], pair_settings, progress=progress)
+        _LOG.debug("%d pairs answered", outcome.n_pairs)
+        examples = outcome.examples if settings["figures"] else []
+        drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
+        scenes = [data_set.name for data_set in data_sets]
+        data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
+        result = result_files.build_result(
+            experiment=names["experiment"],
+            key=key,
+            meta={**_collect_metadata(settings), "code": code},
+            config=settings,
+            data=data,
+            summary=outcome.summary,
+            rows=outcome.rows,
+            question=outcome.question,
+            expectation=outcome.expectation,
+            verdict=outcome.verdict,
+            why=outcome.why,
+            metrics=[asdict(metric) for metric in outcome.metrics],
+        )
+        root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
+        if root is not None:
+            storage.replace_file(folder / DATA_ROOT_FILE, f"{Path(root).resolve()}\n".encode())
+        result_files.write_result(target, result)
+        finished.remove()
+        _print_result(result, [target, *drawn], swept=swept)
+        return JobStatus(str(folder), "finished")
 
 
 def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:

@@ -31,11 +31,9 @@ from dhtorch.measure.pin import CameraPin
 from dhtorch.pytree import collate
 from dhtorch.records import Camera, Frame, PinResult
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.viewer.pin import PinnedEpisode, write_pin_page
-
-Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: Names that ``fail_on`` accepts → the quantity compared with the limit.
 _PIN_LIMITS = {
@@ -115,7 +113,14 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
                 f"; from frame {episode.numbers[c.first]} by {c.shift_px:.1f} px" for c in episode.changes
             )
             print(f"{episode.name}: {describe_pin(episode.middle)}{counted}{changes}")
-        summary = _summarise(episodes)
+        # Totals over episodes, and the quantities that ``fail_on`` limits
+        verdicts = [name(PinVerdict, episode.verdict).lower() for episode in episodes]
+        unknown = torch.cat([episode.result.verdict for episode in episodes]) == PinVerdict.CANNOT_KNOW
+        shifts = [shift for episode in episodes if (shift := episode.shift) is not None]
+        summary = {
+            "episodes": {word: verdicts.count(word) for word in ("moved", "not_moved", "cannot_know")},
+            "limited": {"moved": max(shifts, default=None), "unknown": float(unknown.double().mean())},
+        }
         exceeded = list_exceeded_limits(summary, limits, _PIN_LIMITS)
         content = {"ref": str(settings["ref"]), "source": str(settings["source"]), "metric": pin.metric}
         content |= {"false_alarm_rate": rate, "notes": pin.notes, "fail_on": settings["fail_on"]}
@@ -230,17 +235,6 @@ def _compare_pictures(
 
 
 # ------------------------------------------------------------------------------------------------------------- results
-
-
-def _summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Totals over episodes, and the quantities that ``fail_on`` limits."""
-    verdicts = [name(PinVerdict, episode.verdict).lower() for episode in episodes]
-    unknown = torch.cat([episode.result.verdict for episode in episodes]) == PinVerdict.CANNOT_KNOW
-    shifts = [shift for episode in episodes if (shift := episode.shift) is not None]
-    return {
-        "episodes": {word: verdicts.count(word) for word in ("moved", "not_moved", "cannot_know")},
-        "limited": {"moved": max(shifts, default=None), "unknown": float(unknown.double().mean())},
-    }
 
 
 def _row_of(episode: Episode) -> dict[str, Any]:

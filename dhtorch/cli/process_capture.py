@@ -25,7 +25,6 @@ from dhtorch import export
 from dhtorch.cli import complete, recover_page
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.capture_checks import describe_missing_depth, print_check
-from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, describe_pictures, find_captures
 from dhtorch.data import FORMATS, FormatError, open_all
@@ -40,7 +39,7 @@ from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Pose
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation.capture_check import check_capture
 from dhtorch.viz.plots import (

@@ -118,7 +118,7 @@ _JOB_STATES = {"finished": "finished", "untouched": "left untouched", "failed": 
 #: Default ``output`` with ``resume=true``.
 _RESUMED_FOLDER = Path("outputs/resumed")
 
-#: Captures below a path that a message names. Source: origin not recorded.
+#: Captures below a path that a message names.
 _MAX_CAPTURES_SHOWN = 4
 
 _SEPARATORS = "/\\"

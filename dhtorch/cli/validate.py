@@ -11,14 +11,14 @@ import math
 import re
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from dhtorch.cli.completed_folder import load_frame
+from dhtorch.cli.completed_folder import Row, load_frame
 from dhtorch.codes import State, WrongCause, names, words
 from dhtorch.data import depth_maps
 from dhtorch.data import intrinsics as intrinsics_options
@@ -29,16 +29,13 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pytree import stack
 from dhtorch.records import DepthValidation
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation import faults
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.validate import share_interval, validate_depth
 from dhtorch.viz.plots import append_cutoff, draw_validation, format_frame
 from dhtorch.viz.viewer import validation as pages
-
-Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
-Row = dict[str, Any]
 
 #: Statistics of a frame that have a confidence interval.
 _INTERVAL_FIELDS = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")

@@ -27,6 +27,9 @@ from dhtorch.runtime.storage import read_utf8
 from dhtorch.viz.viewer import again, html, points, rrd
 from dhtorch.viz.viewer.exhibit import Exhibit
 
+#: Printed where the page is written for want of Rerun.
+_NO_RERUN = "Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead"
+
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
     """Show the result or recording of the settings; returns the exit code.
@@ -47,7 +50,10 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     folder = Path(settings["output"]) if target is None else target if target.is_dir() else target.parent
     notes: list[str] = []
     if page is None and recording is None:
-        page, recording, notes = _choose_file(folder)
+        if importlib.util.find_spec("rerun") is None:
+            page, notes = str(folder / "view.html"), [_NO_RERUN]
+        elif not has_screen():
+            recording = str(folder / "view.rrd")
     with contextlib.ExitStack() as stack:
         for option, name in (("html", page), ("save", recording)):
             if name is not None:
@@ -82,7 +88,11 @@ def _make_scene(
         config, name = result["config"], settings["scene"]
         result_settings = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
         try:
-            parts = again.rebuild_parts(result, settings["root"] or _read_data_root(folder))
+            # The data folder recorded beside a result, where it still exists
+            note = folder / DATA_ROOT_FILE
+            root = read_utf8(note).strip() if is_whole(note) else ""
+            known = root if root and Path(root).exists() else None
+            parts = again.rebuild_parts(result, settings["root"] or known)
             scene = _compute_exhibit(parts, result_settings, partial(again.read_cutoff, result), progress)
         except (OSError, FormatError) as error:
             scenes = result["data"]["scenes"]
@@ -96,13 +106,6 @@ def _make_scene(
         facts = {"experiment": result["experiment"], "data": result["data"]["name"], "created": result["meta"]["utc"]}
         return replace(scene, facts={**facts, **scene.facts})
     return _compute_exhibit(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
-
-
-def _read_data_root(folder: Path) -> str | None:
-    """Data folder recorded beside a result, None where it no longer exists."""
-    note = folder / DATA_ROOT_FILE
-    root = read_utf8(note).strip() if is_whole(note) else ""
-    return root if root and Path(root).exists() else None
 
 
 def _compute_exhibit(
@@ -137,14 +140,6 @@ def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> A
     if isinstance(wanted, int) and 0 <= wanted < len(names):
         return items[wanted]
     raise ValueError(f"scene: found {wanted!r}, expected a number below {len(names)} or one of {', '.join(names[:12])}")
-
-
-def _choose_file(folder: Path) -> tuple[str | None, str | None, list[str]]:
-    """Page, recording and notes where the options name no file; no file where Rerun's viewer can open."""
-    if importlib.util.find_spec("rerun") is None:
-        note = "Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead"
-        return str(folder / "view.html"), None, [note]
-    return None, None if has_screen() else str(folder / "view.rrd"), []
 
 
 def has_screen() -> bool:

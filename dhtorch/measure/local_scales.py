@@ -22,7 +22,7 @@ from dhtorch.metrics.grouped import grouped_slopes, huber_mean, mad_sigma, mean_
 #: 25 returns with 400 samples in a picture.
 REGIONS = (3, 4)
 
-#: Fewest ratios of a local scale. Source: origin not recorded.
+#: Fewest ratios of a local scale.
 MIN_RATIOS = 6
 
 #: Least standard deviation of a local scale, as a log ratio: errors that neighbouring returns share. Source: chosen on:

@@ -15,10 +15,13 @@ import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
+
+#: Wrapper of a loop that shows its progress: (items, text, number of items) → items.
+Progress = Callable[..., Iterable[Any]]
 
 #: Flag → level.
 VERBOSITY_FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"}
@@ -27,7 +30,7 @@ _VERBOSITY_VARIABLE = "DHTORCH_VERBOSITY"
 #: Time between two lines of progress where stderr is no terminal, s. Source: chosen so that short jobs print none.
 _LINE_INTERVAL_S = 30.0
 
-#: Names of a folder that are compared with a missing one. Source: origin not recorded; bounds the time of a message.
+#: Names of a folder that are compared with a missing one. Bounds the time of a message.
 _MAX_NAMES_COMPARED = 2000
 
 #: End of the help text of sub-commands with their own argument parser.

@@ -5,7 +5,6 @@ import inspect
 import io
 import json
 import shutil
-import struct
 from functools import cache
 
 import hydra
@@ -22,7 +21,7 @@ from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
-from dhtorch.geometry.camera import resize, unproject
+from dhtorch.geometry.camera import resize
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import completion, dense
 from dhtorch.pipeline.view_report import with_view_selection
@@ -136,44 +135,12 @@ def test_the_meta_file_tells_what_the_others_are(room, numbered):
     assert about["codes"]["source"] == {str(k): v for k, v in names(Source).items()}
 
 
-def test_the_folder_is_read_again_as_numbered_frames(captures, numbered):
-    there, back = data.open(captures / "numbered"), data.open(numbered)
-    assert back.format == "frames_dir" and back.number.tolist() == [0, 1, 2]
-    assert torch.equal(back[1].image, there[1].image) and torch.equal(back[1].camera.f, there[1].camera.f)
-    assert torch.equal(back.poses.t, there.poses.t[:3]) and torch.equal(back.poses.R, there.poses.R[:3])
-    depth = pixels(numbered / "depth" / "000001.png")
-    assert np.array_equal((back[1].depth[0] * 1000).round().numpy(), depth)
-    near = (there[1].depth > 0) & (there[1].depth <= NEAR)
-    assert torch.allclose(back[1].depth[near], there[1].depth[near], atol=1e-6), (
-        "the sensor's own, bit for bit but for mm"
-    )
-
-
 def test_figure_and_points_are_of_the_first_frame(room, numbered):
     files = [
         p.relative_to(numbered).as_posix() for k in completed.EXTRA_FILES for p in sorted((numbered / k).glob("*"))
     ]
     assert files == ["figures/000000.png", "points/000000.glb", "points/000000.ply"]
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
-    head, _, body = (numbered / "points" / "000000.ply").read_bytes().partition(b"end_header\n")
-    depth, source = (pixels(numbered / kind / "000000.png") for kind in ("depth", "source"))
-    layout = (
-        [(a, "<f4") for a in "xyz"]
-        + [(c, "u1") for c in "rgb"]
-        + [("sigma", "<f4"), ("source", "u1"), ("quality", "<f4")]
-    )
-    points = np.frombuffer(body, layout)
-    assert f"element vertex {(depth > 0).sum()}".encode() in head and len(points) == (depth > 0).sum()
-    assert np.array_equal(points["source"], source[depth > 0])
-    v, u = np.nonzero(depth)
-    z = torch.from_numpy(depth[v, u] * 0.001).float()
-    xyz = unproject(room[0].camera, torch.from_numpy(np.stack((u, v), -1)).float()[None], z[None])[0]
-    assert np.allclose(np.stack([points[a] for a in "xyz"], -1), xyz, atol=1e-5)
-    colour = room[0].image[0].permute(1, 2, 0).numpy()[v, u]
-    assert np.array_equal(np.stack([points[c] for c in "rgb"], -1), colour)
-    glb = (numbered / "points" / "000000.glb").read_bytes()
-    (length,) = struct.unpack("<I", glb[12:16])
-    assert glb[:4] == b"glTF" and json.loads(glb[20 : 20 + length])["meshes"][0]["primitives"][0]["mode"] == 4
 
 
 def test_a_tum_sequence_stays_one_with_its_own_step_and_stamps(captures, tmp_path):

@@ -440,17 +440,23 @@ def test_the_printed_next_command_runs_with_the_reader_options_of_this_one(
     assert code == 0 and re.search(r"coverage|answered", out), err
 
 
-@pytest.mark.parametrize("depth", [0.9531, 1.0, 104.2, 9.96, 0.0123, None])
-def test_the_printed_cutoff_lies_among_the_returns(monkeypatch, depth):
-    source = np.full((4, 4), int(Source.NONE if depth is None else Source.SENSOR))
-    maps = {"depth": np.full((4, 4), depth or 1.0)}, source
-    monkeypatch.setattr(process_capture.completed, "read_completed_maps", lambda *_: maps)
+@pytest.mark.parametrize(
+    ("depths", "low", "high"),
+    [
+        *(([[depth] * 3], depth, 1.11 * depth) for depth in (0.9531, 1.0, 104.2, 9.96, 0.0123)),
+        ([[1.0, 1.23, 9.0], [2.0, 1.25, 0.0], [0.0, 0.0, 0.0]], 1.5, 1.5),  # of 1.23 and 1.625
+        ([[0.0]], 2.0, 2.0),
+    ],
+)
+def test_the_printed_cutoff_lies_among_the_returns(monkeypatch, depths, low, high):
+    maps = lambda _, i: ({"depth": np.array(depths[i])}, np.full(len(depths[i]), int(Source.SENSOR)))  # noqa: E731
+    monkeypatch.setattr(process_capture.completed, "read_completed_maps", maps)
     settings = {"data": {"fov": 60, "K": None, "camera": ["a"]}, "path": "x", "reader_format": "tum"}
-    task = SimpleNamespace(settings=settings, scene=SimpleNamespace(name="x"), frames=[0])
-    line = process_capture._format_next_step(process_capture.RecoveredFrames(task, [0], {}, 0), "a.html")
+    task, frames = SimpleNamespace(settings=settings, scene=SimpleNamespace(name="x")), list(range(len(depths)))
+    line = process_capture._format_next_step(process_capture.RecoveredFrames(task, frames, {}, 0), "a.html")
     words, _, cutoff = line.rpartition(" --cutoff ")
     assert words.endswith("dhtorch run x data.fov=60 'data.camera=[a]' data.format=tum")
-    assert float(cutoff) == 2.0 if depth is None else depth <= float(cutoff) < 1.11 * depth
+    assert low <= float(cutoff) <= high
 
 
 # -------------------------------------------------------------------------------------------------------------- sweeps

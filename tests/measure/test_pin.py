@@ -12,11 +12,9 @@ from dhtorch.cli.pin import describe_pin, guide_pin
 from dhtorch.codes import PinReason, PinVerdict
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix
-from dhtorch.geometry.covariance import chi2_quantile
 from dhtorch.geometry.se3 import Pose
 from dhtorch.measure import CameraPin, PinResult, find_change_points
 from dhtorch.pytree import collate
-from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
 from dhtorch.synthetic.paths import hand_held_path
 
@@ -159,32 +157,26 @@ def test_a_capture_as_reference_leaves_out_what_moves():
     assert moving.notes and torch.equal(moving.frame.image, room()[0].image)
 
 
-def test_given_intrinsics_replace_the_references():
-    K = to_matrix(room()[0].camera)
+def test_given_intrinsics_replace_the_references_which_are_those_of_the_images_size():
+    K, camera = to_matrix(room()[0].camera), pinned()._live_camera(None, 2, (60, 80))
     assert torch.allclose(pinned().check(room()[1].image, K[0]).offset, found().offset[1:2])
-    zoomed = K.clone()
-    zoomed[:, :2, :2] *= 1.05
-    assert not torch.allclose(pinned().check(room()[1].image, zoomed).offset, found().offset[1:2], atol=1e-3)
-
-
-def test_a_picture_of_another_size_has_the_references_camera_at_its_size():
-    camera = pinned()._live_camera(None, 2, (60, 80))
+    K[:, :2, :2] *= 1.05
+    assert not torch.allclose(pinned().check(room()[1].image, K).offset, found().offset[1:2], atol=1e-3)
     torch.testing.assert_close(camera.f, room()[0].camera.f.expand(2, 2) / 2)
     torch.testing.assert_close(camera.c, (room()[0].camera.c.expand(2, 2) + 0.5) / 2 - 0.5)
 
 
-def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="false_alarm_rate"):
-        CameraPin(room()[0], false_alarm_rate=1.5)
-    with pytest.raises(ValueError, match="texture"):
-        CameraPin(room()[0].replace(image=torch.zeros(1, 3, 120, 160)))
-    with pytest.raises(ValueError, match="image"):
-        pinned().check(torch.zeros(120, 160))
-
-
-@pytest.mark.parametrize(("p", "degrees", "expected"), [(0.99, 6, 16.8119), (0.95, 3, 7.8147), (0.999, 6, 22.4577)])
-def test_quantiles_are_those_of_the_tables(p, degrees, expected):
-    assert chi2_quantile(p, degrees) == pytest.approx(expected, abs=1e-3)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: CameraPin(room()[0], false_alarm_rate=1.5), "false_alarm_rate"),
+        (lambda: CameraPin(room()[0].replace(image=torch.zeros(1, 3, 120, 160))), "texture"),
+        (lambda: pinned().check(torch.zeros(120, 160)), "image"),
+    ],
+)
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 # --------------------------------------------------------------------------------------------------- series and words
@@ -246,46 +238,42 @@ def test_one_wrong_picture_is_no_change(wrong):
     assert find_change_points(series(offsets)) == []
 
 
-def test_the_guide_says_which_way_back():
-    text = guide_pin(series(torch.tensor([[0.0, 0.0, 0.0, 0.010, 0.0, -0.005]])))
-    assert text[:2] == ["← left 10.0 mm", "⊗ forward 5.0 mm"]
-    turned = guide_pin(series(torch.tensor([[0.0, math.radians(1.0), 0.0, 0.0, 0.0, 0.0]])))
-    assert turned[0] == "↶ turn left 1.00°"
-    tilted = guide_pin(series(torch.tensor([[math.radians(2.0), 0.0, math.radians(-3.0), 0.0, 0.0, 0.0]])))
-    assert "⤓ tilt down 2.00°" in tilted and "⟳ roll right 3.00°" in tilted
-    assert guide_pin(series(torch.zeros(1, 6)))[0] == "in place"
-    unknown = series(torch.tensor([[0.0, 0.0, 0.0, 0.010, -0.002, -0.005]])).replace(metric=torch.tensor([False]))
-    assert guide_pin(unknown)[0] == "mainly ← left, by an unknown length"
+DEGREE = math.radians(1.0)
+
+
+@pytest.mark.parametrize(
+    ("offset", "metric", "guide"),
+    [
+        ([0.0, 0.0, 0.0, 0.010, 0.0, -0.005], True, ["← left 10.0 mm", "⊗ forward 5.0 mm"]),
+        ([0.0, 0.0, 0.0, -0.010, 0.004, 0.005], True, ["→ right 10.0 mm", "↑ up 4.0 mm", "⊙ back 5.0 mm"]),
+        ([0.0, DEGREE, 0.0, 0.0, 0.0, 0.0], True, ["↶ turn left 1.00°"]),
+        ([0.0, -DEGREE, 0.0, 0.0, -0.003, 0.0], True, ["↓ down 3.0 mm", "↷ turn right 1.00°"]),
+        ([2 * DEGREE, 0.0, -3 * DEGREE, 0.0, 0.0, 0.0], True, ["⤓ tilt down 2.00°", "⟳ roll right 3.00°"]),
+        ([-2 * DEGREE, 0.0, 3 * DEGREE, 0.0, 0.0, 0.0], True, ["⤒ tilt up 2.00°", "⟲ roll left 3.00°"]),
+        ([0.0] * 6, True, ["in place"]),
+        ([0.0009 * DEGREE / 0.0175, 0.0, 0.0, 0.0019, 0.0, 0.0], True, ["in place"]),
+        ([0.0, 0.0, 0.0, 0.010, -0.002, -0.005], False, ["mainly ← left, by an unknown length"]),
+    ],
+)
+def test_the_guide_says_which_way_back_and_the_line_states_sigmas(offset, metric, guide):
+    result = series(torch.tensor([offset])).replace(metric=torch.tensor([metric]))
+    *lines, shift = guide_pin(result)
+    px = 500 * math.hypot(*offset)
+    assert lines == guide and shift == f"shift {px:.1f} ± 0.1 px"
+    turn, length = math.degrees(math.hypot(*offset[:3])), 1e3 * math.hypot(*offset[3:])
+    words = f"not moved, {px:.2f} ± 0.05 px, turned by {turn:.3f} ± 0.010°, displaced "
+    assert describe_pin(result).startswith(words + (f"by {length:.1f} ± 0.2 mm" if metric else "along ("))
 
 
 def test_the_guide_brings_a_camera_back():
     """Following the words: the live camera displaced by what they say stands where the reference stood."""
     result = found()[2:3]
     back = se3.invert(result.T_ref_from_live)
-    lines = guide_pin(result)
-    names = {
-        "→ right": (0, 1),
-        "← left": (0, -1),
-        "↓ down": (1, 1),
-        "↑ up": (1, -1),
-        "⊗ forward": (2, 1),
-        "⊙ back": (2, -1),
-    }
+    lines = [line.split() for line in guide_pin(result)]
+    ways = {"right": (0, 1), "left": (0, -1), "down": (1, 1), "up": (1, -1), "forward": (2, 1), "back": (2, -1)}
     step = torch.zeros(3, dtype=torch.float64)
-    for line in lines:
-        for words, (axis, sign) in names.items():
-            if line.startswith(words):
-                step[axis] = sign * float(line.removeprefix(words).split()[0]) / 1e3
+    for axis, sign, length in ((*ways[line[1]], float(line[2])) for line in lines if line[-1] == "mm"):
+        step[axis] = sign * length / 1e3
     assert float((step - back.t[0]).abs().max()) < 0.0021
     there = se3.compose(se3.exp(OFFSETS[2:3]), Pose(back.R, step[None]))
     assert float(there.t.norm()) < 0.008
-
-
-def test_the_line_of_a_picture_states_its_sigmas():
-    line = describe_pin(series(torch.tensor([[0.0, 0.0, 0.0, 0.010, 0.0, 0.0]])))
-    assert line.startswith("not moved, 5.00 ± 0.05 px") and "displaced by 10.0 ± 0.2 mm" in line
-
-
-def test_the_public_name_is_the_class():
-    assert dhtorch.CameraPin is CameraPin and dhtorch.PinResult is PinResult
-    assert isinstance(SyntheticRoom, type)

@@ -11,7 +11,7 @@ import io
 import itertools
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,16 @@ def same(value: Any, want: Any, tolerance: float = 0.0) -> None:
     np.testing.assert_allclose(np.asarray(value, np.float64), np.asarray(want, np.float64), rtol=0, atol=tolerance)
 
 
+def hold(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Assert that fields have their values: equal, or (numbers, tolerance), whatever their shape."""
+    for name, want in wanted.items():
+        values, tolerance = want if isinstance(want, tuple) else (want, 0.0)
+        if isinstance(values, np.ndarray):
+            same(np.reshape(found[name], values.shape), values, tolerance)
+        else:
+            assert found[name] == (pytest.approx(values, abs=tolerance) if tolerance else values), name
+
+
 # --------------------------------------------------------------------------------------------------- enrich, LeRobot
 
 
@@ -94,11 +104,14 @@ def check_maps(row: dict[str, Any], camera: int, e: int, i: int, depth_key: str)
     key = depth_key.removesuffix("_enriched").removesuffix("_depth")
     name = key.removeprefix("observation.images.")
     has_return = known.depth(camera, e, i) > 0
-    same(row[depth_key], stored_depth(camera, e, i)[None])
-    same(row[f"{depth_key}_sigma"], stored_sigma(camera, e, i)[None], SIGMA_STEP)  # on the edge of two steps
-    same(row[f"{key}_dhtorch_source"], np.where(has_return, Source.SENSOR, Source.NONE)[None])
-    same(np.reshape(row[f"observation.{name}.intrinsics"], (3, 3)), known.intrinsics(camera, e, i))
-    same(np.reshape(row[f"observation.{name}.T_world_from_cam"], (4, 4)), known.pose(camera, e, i), 1e-7)
+    wanted = {
+        depth_key: stored_depth(camera, e, i),
+        f"{depth_key}_sigma": (stored_sigma(camera, e, i), SIGMA_STEP),  # on the edge of two steps
+        f"{key}_dhtorch_source": np.where(has_return, Source.SENSOR, Source.NONE),
+        f"observation.{name}.intrinsics": known.intrinsics(camera, e, i),
+        f"observation.{name}.T_world_from_cam": (known.pose(camera, e, i), 1e-7),
+    }
+    hold(row, wanted)
 
 
 @pytest.fixture(scope="module", params=[3, 2])
@@ -113,16 +126,14 @@ def test_every_row_of_a_robots_set_has_its_own_numbers(robot: tuple[int, Path]) 
     rows = read_rows(robot[1])
     assert len(rows) == sum(LENGTHS)
     for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
-        assert (row["index"], row["episode_index"], row["frame_index"]) == (index, e, i)
-        assert row["timestamp"] == np.float32(i / FPS) and row["task_index"] == known.task(e, i)
-        assert row["note"] == f"step {i} of {e}"
-        same(row["observation.state"], known.joints(e, i))
-        same(row["action"], known.action(e, i))
+        own = {"index": index, "episode_index": e, "frame_index": i, "timestamp": np.float32(i / FPS)}
+        own |= {"task_index": known.task(e, i), "note": f"step {i} of {e}"}
+        own |= {"observation.state": known.joints(e, i), "action": known.action(e, i)}
         for camera, key in enumerate(KEYS):
             check_maps(row, camera, e, i, f"{key}_depth_enriched")
-            same(row[f"{key}_depth"], known.depth(camera, e, i)[None])
-            same(np.reshape(row[f"{key}.intrinsics"], (3, 3)), known.intrinsics(camera, e, i))
-            same(np.reshape(row[f"{key}.pose"], (4, 4)), known.pose(camera, e, i), 1e-9)
+            own |= {f"{key}_depth": known.depth(camera, e, i), f"{key}.intrinsics": known.intrinsics(camera, e, i)}
+            own[f"{key}.pose"] = known.pose(camera, e, i), 1e-9
+        hold(row, own)
 
 
 def test_the_metadata_lead_to_the_rows_and_video_frames_of_every_episode(robot: tuple[int, Path]) -> None:
@@ -216,8 +227,8 @@ def test_several_recordings_of_several_cameras_are_episodes_of_one_set(tmp_path:
     rows = read_rows(out)
     assert len(rows) == sum(LENGTHS)
     for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
-        assert (row["index"], row["episode_index"], row["frame_index"], row["task_index"]) == (index, e, i, 0)
-        assert row["timestamp"] == np.float32(i / FPS) and row["observation.frame_number"] == i
+        own = {"index": index, "episode_index": e, "frame_index": i, "task_index": 0, "observation.frame_number": i}
+        hold(row, own | {"timestamp": np.float32(i / FPS)})
         for camera, key in enumerate(KEYS):
             assert np.array_equal(pixels(row[key]["bytes"]), known.picture(camera, e, i))
             check_maps(row, camera, e, i, f"{key}_depth")
@@ -231,12 +242,11 @@ def test_steps_of_rlds_keep_every_number(tmp_path: Path) -> None:
     rows, key = read_rows(out), "observation.images.image_0"
     assert len(rows) == sum(LENGTHS)
     for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
-        assert (row["index"], row["episode_index"], row["frame_index"]) == (index, e, i)
-        assert row["timestamp"] == np.float32(i / FPS) and row["is_last"] == (i == LENGTHS[e] - 1)
-        same(row["action"], 1000 * e + 7 * i + np.arange(7))
+        own = {"index": index, "episode_index": e, "frame_index": i, "timestamp": np.float32(i / FPS)}
+        own |= {"is_last": i == LENGTHS[e] - 1, "action": 1000 * e + 7 * i + np.arange(7)}
+        own |= {"observation.image_0_intrinsics": known.intrinsics(1, e, i)}
+        hold(row, own | {"observation.image_0_T_world_from_cam": (known.pose(1, e, i), 1e-6)})
         assert np.array_equal(pixels(row[key]["bytes"]), known.picture(1, e, i))
-        same(np.reshape(row["observation.image_0_T_world_from_cam"], (4, 4)), known.pose(1, e, i), 1e-6)
-        same(np.reshape(row["observation.image_0_intrinsics"], (3, 3)), known.intrinsics(1, e, i))
         check_maps(row, 1, e, i, f"{key}_depth")
 
 
@@ -251,11 +261,11 @@ def test_nerfstudio_folders_are_of_their_own_camera_and_episode(tmp_path: Path) 
         assert len(content["frames"]) == LENGTHS[e]
         for i, shot in enumerate(content["frames"]):
             K, z, sigma = (of(camera, e, i) for of in (known.intrinsics, stored_depth, stored_sigma))
-            size = [shot[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
-            same(size, [HW[1], HW[0], K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5])
-            same([shot.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")], LENS if camera else np.zeros(5), 1e-7)
-            same(shot["transform_matrix"], known.pose(camera, e, i) @ np.diag([1, -1, -1, 1]), 1e-7)
-            assert shot["timestamp"] == pytest.approx(i / FPS, abs=1e-6)
+            lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), ((x, 1e-7) for x in map(float, LENS)), strict=True))
+            own = {"w": HW[1], "h": HW[0], "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
+            own |= {"timestamp": (i / FPS, 1e-6), **(lens if camera else {})}
+            hold(shot, own | {"transform_matrix": (known.pose(camera, e, i) @ np.diag([1, -1, -1, 1]), 1e-7)})
+            assert camera or not any(shot.get(k) for k in lens)
             steps = pixels(file.parent / shot["depth_file_path"])
             same(steps, np.rint(z / 1e-3))
             relative = np.divide(sigma, z, where=z > 0, out=np.zeros_like(z))
@@ -324,15 +334,23 @@ def test_complete_writes_the_numbers_of_every_frame(completed: Path) -> None:
     same(about["K"], known.intrinsics(1, 1, 0))
     for i in range(4):
         K, T, z, time = (of(1, 1, i) for of in (known.intrinsics, known.pose, known.depth, known.time))
-        same(about["K_frames"][i], [K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-        assert about["times"][i] == pytest.approx(time, abs=1e-6)
+        hold(
+            {k: about[k][i] for k in ("K_frames", "times")},
+            {"K_frames": K[[0, 1, 0, 1], [0, 1, 2, 2]], "times": (time, 1e-6)},
+        )
         same(poses[i], T, 1e-7)
         row = read_json(completed, "meta", f"{i + 1:06d}.json")
-        same(row["K"], K)
-        same(row["T_world_from_cam"], T, 1e-7)
-        same(row["distortion"], LENS, 1e-7)
-        assert row["frame"] == i + 1 and row["time"] == pytest.approx(time, abs=1e-6) and row["hw"] == list(HW)
-        assert (row["unit_m"], row["sigma_unit_m"]) == (1e-3, 2e-4) and i + 1 not in row["views"]
+        own = {
+            "K": K,
+            "T_world_from_cam": (T, 1e-7),
+            "distortion": (np.array(LENS), 1e-7),
+            "hw": list(HW),
+            "frame": i + 1,
+        }
+        own |= {"time": (time, 1e-6), "unit_m": 1e-3, "sigma_unit_m": 2e-4}
+        own["pixels"] = {"none": int((z == 0).sum()), "sensor": int((z > 0).sum()), "swept": 0}
+        hold(row, own)
+        assert i + 1 not in row["views"]
         depth, sigma, source, image = (
             pixels(completed / kind / f"{i + 1:06d}.png") for kind in ("depth", "sigma", "source", "images")
         )
@@ -340,7 +358,6 @@ def test_complete_writes_the_numbers_of_every_frame(completed: Path) -> None:
         same(sigma, np.rint(SIGMA_REL * z.astype(np.float64) / 2e-4), 1)  # on the edge of two steps
         same(source, z > 0)
         assert np.array_equal(image, known.picture(1, 1, i))
-        assert row["pixels"] == {"none": int((z == 0).sum()), "sensor": int((z > 0).sum()), "swept": 0}
         arrays = np.load(completed / "arrays" / f"{i + 1:06d}.npz")
         same(np.nan_to_num(arrays["depth"]), z)
         same(np.nan_to_num(arrays["sigma"]), SIGMA_REL * z, 1e-7)
@@ -428,14 +445,11 @@ def check_tokens(row: dict[str, Any], u: Array, v: Array, valid: Array) -> None:
 
 
 def read_ply(file: Path) -> Array:
-    """Vertices of a binary PLY file, by its header."""
-    head, _, body = file.read_bytes().partition(b"end_header\n")
-    lines = [line.split() for line in head.decode().splitlines()]
-    assert lines[1][1] == "binary_little_endian"
-    n = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
-    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
-    columns = [(line[2], kinds[line[1]]) for line in lines if line[0] == "property" and line[1] != "list"]
-    return np.frombuffer(body, columns, n)
+    """Vertices of a PLY file."""
+    plyfile = pytest.importorskip("plyfile")
+    data = plyfile.PlyData.read(file)
+    assert not data.text and data.byte_order == "<"
+    return data["vertex"].data
 
 
 def read_glb(file: Path) -> tuple[list[Any], list[dict[str, Array]]]:
@@ -612,13 +626,11 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
     file = html.write_viewer_page(tmp_path / "a.html", Exhibit("known", [shot], views, path, {"k": "v"}))
     data = json.loads(file.read_text().partition('type="application/json" id="data">')[2].partition("</script>")[0])
     for k, (view, sent) in enumerate(zip(views, data["views"], strict=True)):
-        assert (sent["number"], sent["time"]) == (10 + k, view.time)
-        assert (sent["hw"], sent["f"], sent["c"]) == (list(view.hw), list(view.f), list(view.c))
+        hold(sent, {"number": 10 + k, "time": view.time, "hw": list(view.hw), "f": list(view.f), "c": list(view.c)})
         assert base64.b64decode(sent["jpeg"]) == view.jpeg
     (sent,) = data["shots"]
-    assert (sent["label"], sent["view_0"], sent["view_1"]) == ("a pair", 0, 1)
-    same(np.reshape(sent["T_world_from_0"], (3, 4)), known.pose(0, 0, 1)[:3])
-    same(np.reshape(sent["T_world_from_1"], (3, 4)), known.pose(1, 1, 3)[:3])
+    own = {"label": "a pair", "view_0": 0, "view_1": 1, "T_world_from_0": known.pose(0, 0, 1)[:3]}
+    hold(sent, own | {"T_world_from_1": known.pose(1, 1, 3)[:3]})
     same(unpack(data["path"]), path.ravel(), 1e-7)
     for name, values in columns.items():
         packed = unpack(sent["samples"][name])
@@ -630,10 +642,9 @@ def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) ->
         half_step = 0.501 * np.ptp(cloud.xyz, 0).max() / 65535  # 16 bits between the least and the largest coordinate
         same(unpack(sent[name]["xyz"]).reshape(-1, 3) * sent[name]["step"] + sent[name]["low"], cloud.xyz, half_step)
         same(unpack(sent[name]["rgb"]), cloud.rgb.ravel())
-    same(unpack(sent["swept"]["sigma"]), swept.sigma)
-    same(unpack(sent["swept"]["score"]) / 65535, swept.score, 1e-5)
-    same(unpack(sent["swept"]["cause"]), columns["cause"])
-    same(unpack(sent["swept"]["source"]), 3 + 2 * columns["tracked"])
+    numbers = {name: unpack(sent["swept"][name]) for name in ("sigma", "score", "cause", "source")}
+    own = {"sigma": swept.sigma, "score": (65535 * swept.score, 0.65), "cause": columns["cause"]}
+    hold(numbers, own | {"source": 3 + 2 * columns["tracked"]})
     assert sent["swept"]["step_px"] == 2.0
 
 
