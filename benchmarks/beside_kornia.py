@@ -9,17 +9,17 @@ the formula that it replaced.
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import harness
 import torch
+from cells import read
+from cells import table as markdown
 from kornia import filters as kf
 from kornia.feature import gftt_response
 from kornia.geometry import epipolar as ke
@@ -32,7 +32,6 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from dhtorch import MAP, PAPER, complete_depth
-from dhtorch.experiments.report import ReportTable, text
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, filters, least_squares, pyramid, se3
 from dhtorch.geometry.patches import luma
@@ -40,8 +39,6 @@ from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime import storage
 from dhtorch.stages import holes
 from dhtorch.synthetic import SyntheticRoom
-
-RESULTS = Path(__file__).resolve().parent / "results"
 
 #: Limits the part of a call's time that kornia's function adds where its bits are the same and it is used, in per cent.
 #: Source: chosen, as the spread of a call's time between runs (``spread_percent`` of the result).
@@ -248,7 +245,7 @@ def run(repeats: int, clock: str) -> list[dict[str, Any]]:
 
 def table() -> str:
     """The rows of the result file, those that are kornia's first."""
-    rows = json.loads((RESULTS / "kornia.json").read_text())
+    rows = read("kornia")
     shown = []
     for r in sorted(rows, key=lambda r: r["used"] != "kornia"):
         cells = [f"`{r['name']}`", f"`{r['kornia']}`", r["used"], ratio(r["ratio"])]
@@ -261,7 +258,7 @@ def table() -> str:
         f"`{name}` {first['total_ms'][name]:.0f} ms ± {first['spread_percent'][name]:.1f} %" for name in METHODS
     )
     where = f"Measured on: {first['processor']}; {first['threads']} thread; {versions}. Whole calls: {times}."
-    return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{where}"
+    return f"{markdown(head, shown, n_label=3)}\n\n{where}"
 
 
 def main() -> None:

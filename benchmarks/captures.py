@@ -4,18 +4,12 @@
 
 As a user has it, a process each, but for half a minute a capture instead of four, and at most two recordings of one.
 ``first_s`` is the time from the start of the process until the first preview exists.
-
-    python benchmarks/captures.py --first holo_a --json benchmarks/results/first_picture.json
-
-measures that time alone, three times with the options as they come, and the processor time up to it; the process is
-ended there.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -39,39 +33,9 @@ SHOWN, WIDTH = ("dgp_drive6cam", "holo_a", "tum_fr1_desk9"), 640
 ASIDE = ("Wrote ", "Next: ")
 
 
-#: Repetitions of the first picture alone, and the seconds after which one counts as failed.
-REPETITIONS, TIMEOUT_S = 3, 600
-
-
 def has_picture(out: Path) -> bool:
     """Whether the first preview of a capture, or of one of its recordings, exists."""
     return any(out.glob("previews/*.jpg")) or any(out.glob("*/previews/*.jpg"))
-
-
-def first_picture(path: Path, folder: Path) -> tuple[float, float]:
-    """Wall and processor time from the start of the command until the first preview exists, s."""
-    out, began = folder / path.name, time.perf_counter()
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}"]
-    with subprocess.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while not has_picture(out):
-            if process.poll() is not None or time.perf_counter() - began > TIMEOUT_S:
-                raise SystemExit(f"{path}: no picture in {time.perf_counter() - began:.0f} s, exit {process.poll()}")
-            time.sleep(0.02)
-        wall = time.perf_counter() - began
-        process.terminate()
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-def measure_first(path: Path) -> dict[str, Any]:
-    """The row of the first picture of one capture."""
-    times = []
-    for _ in range(REPETITIONS):
-        with tempfile.TemporaryDirectory() as folder:
-            times.append(first_picture(path, Path(folder)))
-    machine = {"processor": result_files.describe_processor(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
-    return {"name": path.name, "first_s": [t for t, _ in times], "first_cpu_s": [t for _, t in times]} | machine
 
 
 def row(path: Path, folder: Path, options: Sequence[str] = SHORT) -> dict[str, Any]:
@@ -107,16 +71,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--pictures", type=Path, help="keep the overviews of captures that may be shown in this folder")
-    parser.add_argument(
-        "--first", metavar="NAME", help="measure the time until the first picture of this capture alone"
-    )
     options = parser.parse_args()
     data = Path(os.environ["DHTORCH_DATA"])
-    if options.first is not None:
-        measured = [measure_first(data / options.first)]
-        print(*measured)
-        options.json.write_text(storage.dump_strict_json(storage.to_strict_json(measured), indent=1) + "\n")
-        return 0
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted(p for p in data.iterdir() if p.is_dir()):

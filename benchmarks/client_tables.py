@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-RESULTS = Path(__file__).resolve().parent / "results"
+from cells import read, table
 
 #: Reason of a failure (pattern) → what it is, and what helps.
 FIXES: dict[str, tuple[str, str]] = {
@@ -49,10 +47,10 @@ class Outcome(NamedTuple):
 def clients() -> str:
     """Client × version × command: sets on which it passed, and for the others the reason and the fix."""
     groups: dict[tuple[str, str, str], list[Outcome]] = {}
-    for outcome in (*_loaders(), *_trained(), *_plugin(), *_readers()):
+    for outcome in list_outcomes():
         groups.setdefault(outcome[:3], []).append(outcome)
     head = ["client", "version", "command, or what it reads", "passed", "largest depth difference, mm", "reason", "fix"]
-    lines = [head, [":--"] * len(head)]
+    lines = []
     for (client, version, command), outcomes in groups.items():
         run = [outcome for outcome in outcomes if outcome.passed is not None]
         result = f"{sum(bool(outcome.passed) for outcome in run)} of {len(run)}" if run else "not run"
@@ -60,7 +58,7 @@ def clients() -> str:
         texts = ["; ".join(dict.fromkeys(cause[k] for cause in causes if cause[k])) for k in range(2)]
         off = max((outcome.off for outcome in outcomes if outcome.off is not None), default=None)
         lines.append([client, version or "–", command, result, "–" if off is None else f"{1e3 * off:.1g}", *texts])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return table(head, lines, n_label=len(head))
 
 
 def explain(why: str) -> tuple[str, str]:
@@ -69,9 +67,9 @@ def explain(why: str) -> tuple[str, str]:
     return known or (why.replace("|", "/"), "")
 
 
-def _loaders() -> Iterator[Outcome]:
-    """Rows of clients.json; a row without a loader is a format that ``enrich`` refuses for its source."""
-    for row in _read("clients"):
+def list_outcomes() -> Iterator[Outcome]:
+    """Rows of the results; of ``clients`` a row without a loader is a format that ``enrich`` refuses for its source."""
+    for row in read("clients"):
         loader, target = str(row["loader"]), str(row["target"])
         if loader == "–":
             yield Outcome("dhtorch", "", WRITERS[target], False, row["why"])
@@ -86,35 +84,17 @@ def _loaders() -> Iterator[Outcome]:
         command = f"{WRITERS[target][:-1]} {more}`" if more else WRITERS[target]
         off = (row["compared"] or {}).get("largest_difference", {}).get("depth")
         yield Outcome(name, version, command, passed, row["why"], off)
-
-
-def _trained() -> Iterator[Outcome]:
-    """Rows of lerobot_train.json."""
-    for row in _read("lerobot_train"):
+    for row in read("lerobot_train"):
         command = str(row["command"])
         shown = f"`lerobot-train --policy.type={command}`" if command in ("act", "diffusion") else command
         shown = "README's example of a loader" if row["set"] == "README" else shown
         yield Outcome("LeRobot", row["lerobot"], shown, row["passed"], row["why"])
-
-
-def _plugin() -> Iterator[Outcome]:
-    """Rows of lerobot_plugin.json, one for each test of the package."""
-    for row in _read("lerobot_plugin"):
+    for row in read("lerobot_plugin"):  # one for each test of the package
         yield Outcome("LeRobot", row["lerobot"], "tests of `integrations/lerobot`", row["passed"], row["why"])
-
-
-def _readers() -> Iterator[Outcome]:
-    """Rows of readers_3d.json."""
-    for row in _read("readers_3d"):
+    for row in read("readers_3d"):
         writer = "`dhtorch PATH`" if row["written_by"] == "recover" else f"`dhtorch {row['written_by']}`"
         passed = None if row["state"] == "not run" else row["state"] == "passed"
         yield Outcome(row["reader"], row["version"] or "", writer, passed, row["why"])
-
-
-def _read(name: str) -> list[dict[str, Any]]:
-    """Rows of a result file; none where it is not there."""
-    file = RESULTS / f"{name}.json"
-    return list(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else []
 
 
 TABLES: dict[str, Callable[[], str]] = {"clients": clients}

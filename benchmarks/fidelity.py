@@ -6,19 +6,15 @@ either side; it says how far a finding carries.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import reproduce
+from cells import read
+from cells import table as markdown
 
-from dhtorch.experiments.report import text
 from dhtorch.experiments.report.cells import EMPTY_CELL, format_value
 from dhtorch.experiments.report.published import PAPER, PublishedTable, parse_printed
-from dhtorch.experiments.report.tables import ReportTable
-
-RESULTS = Path(__file__).parent / "results"
 
 
 class Finding(NamedTuple):
@@ -109,7 +105,7 @@ FINDINGS: tuple[Finding, ...] = (
 def table() -> str:
     """The page's table, in Markdown."""
     head = ["paper", "line", "figure", "paper", "here", "95 % interval", "n", "deviation", "file"]
-    return text.table_to_markdown(ReportTable("", head, list(_cells()), n_label=3))
+    return markdown(head, list(_cells()), n_label=3)
 
 
 def commands() -> str:
@@ -120,7 +116,7 @@ def commands() -> str:
 
 def _cells() -> Iterator[list[str]]:
     for finding in FINDINGS:
-        result = json.loads((RESULTS / f"{finding.result}.json").read_text(encoding="utf-8"))
+        result = read(finding.result)
         printed = finding.table.lines[finding.line][finding.metric]
         entry = _entry(result["summary"], finding)
         metric = "number" if " / " in finding.entry or finding.entry.endswith("_vs_pose") else finding.metric

@@ -26,7 +26,6 @@ import torch
 from dhtorch.ops import builder, loader
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.runtime.allocator import disable_malloc_trim
 
 #: Rows are measured in torch unless they say otherwise: :func:`with_compiled_operators`.
 os.environ[loader.SWITCH] = "0"
@@ -190,14 +189,6 @@ class _LimitInstructions(argparse.Action):
             os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **AVX2})
 
 
-class _Kept(argparse.Action):
-    """What is freed, by whichever side, stays with this process (:mod:`dhtorch.runtime.allocator`)."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        if not disable_malloc_trim():
-            parser.error("found an allocator that keeps what it likes, expected glibc's without settings of its own")
-
-
 def arguments(description: str) -> argparse.ArgumentParser:
     """The options every script has."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -208,7 +199,6 @@ def arguments(description: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--avx2", action=_LimitInstructions, nargs=0, help="torch, oneDNN, MKL and OpenCV without AVX-512"
     )
-    parser.add_argument("--kept", action=_Kept, nargs=0, help="what is freed stays with the process")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the script knows how")
     return parser
 

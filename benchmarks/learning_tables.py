@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from cells import percent, table
-
-RESULTS = Path(__file__).resolve().parent / "results"
+from cells import percent, read, table
 
 #: What the self-calibration recovers, and how large its error may be on holo_a.
 CALIBRATED = {"focal": ("focal length", 0.005), "scale": ("depth scale", 0.01), "offset": ("time of depth", 0.2)}
@@ -25,7 +21,7 @@ NAMES = {
 
 def self_calibration() -> str:
     """Planted and recovered errors of every seed, and those of the capture as it is."""
-    runs = json.loads((RESULTS / "self_calibration.json").read_text())
+    runs = read("self_calibration")
     rows = []
     for data in dict.fromkeys(run["data"] for run in runs):
         of = [run for run in runs if run["data"] == data]
@@ -52,7 +48,7 @@ def _frames(values: Sequence[float]) -> str:
 def far_labels() -> str:
     """Far and near error of every variant on held-out frames, and the far error's ratio to near labels alone."""
     rows = []
-    for row in _rows("far_labels"):
+    for row in read("far_labels"):
         for variant in ("near", "far", "unweighted", "truth", "constant"):
             cells = [percent(row[f"{variant}.{part}_error"]["value"]) for part in ("far", "near")]
             seeds = row[f"{variant}.far_ratio_of_seeds"]
@@ -65,7 +61,7 @@ def far_labels() -> str:
 def label_quality() -> str:
     """How many frames train and are held out, and how good the far labels of the training frames are."""
     rows = []
-    for row in _rows("far_labels"):
+    for row in read("far_labels"):
         counts = [str(row["training_frames"]), str(row["held_out_frames"])]
         rows.append([NAMES[row["data"]], *counts, *(percent(row[k]) for k in ("answered", "median_rel", "mean_rel"))])
     head = ["data", "training frames", "held out", "far pixels answered", "median error of answers", "mean error"]
@@ -75,7 +71,7 @@ def label_quality() -> str:
 def learned_confidence() -> str:
     """Areas under the risk–coverage curve as ratios to the analytic score, on rooms that were not trained on."""
     rows = []
-    for row in _rows("learned_confidence"):
+    for row in read("learned_confidence"):
         for score in ("paper", "regressed", "by_risk"):
             entry = row[f"{score}.aurc_ratio"]
             spread = "–" if score == "paper" else f"{min(entry['of_seeds']):.3f} to {max(entry['of_seeds']):.3f}"
@@ -86,10 +82,6 @@ def learned_confidence() -> str:
 def interval(entry: Mapping[str, Any], digits: int = 2) -> str:
     """A value with its interval."""
     return f"{entry['value']:.{digits}f} ({entry['low']:.{digits}f}–{entry['high']:.{digits}f})"
-
-
-def _rows(name: str) -> list[dict[str, Any]]:
-    return json.loads((RESULTS / f"{name}.json").read_text())
 
 
 TABLES = {

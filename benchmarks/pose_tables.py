@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from cells import percent, table
+from cells import percent, read, table
 
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.runtime.console import format_count
-
-RESULTS = Path(__file__).resolve().parent / "results"
 
 #: Uses of a given pose, in words.
 USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined": "`refine=True`"}
@@ -70,7 +66,7 @@ def answered_numbers(rows: list[dict[str, Any]]) -> str:
 def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
     """Capture → its rows of one method."""
     by_scene: dict[str, list[dict[str, Any]]] = {}
-    for row in json.loads((RESULTS / "given_poses.json").read_text()):
+    for row in read("given_poses"):
         if row.get("method") == method:
             by_scene.setdefault(row["scene"], []).append(row)
     return by_scene
@@ -78,7 +74,7 @@ def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
 
 def rigs(kind: str) -> list[dict[str, Any]]:
     """Rows of one kind, those of all robots as one of medians."""
-    records = [row for row in json.loads((RESULTS / "rigs.json").read_text()) if row["kind"] == kind]
+    records = [row for row in read("rigs") if row["kind"] == kind]
     rows = [row for row in records if not row["rig"].startswith("robot")]
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in records:
@@ -132,7 +128,7 @@ def rig_answers() -> str:
 def upwards() -> str:
     """Which way is up in every capture: stated, shown by its surfaces, written."""
     rows = []
-    for row in json.loads((RESULTS / "gravity.json").read_text()):
+    for row in read("gravity"):
         stated, why = row.get("stated"), row.get("why", "")
         if "format" not in row:
             rows.append([f"`{row['capture']}`", "", "", "", "", "", f"not opened: {why.partition(': ')[2]}"])

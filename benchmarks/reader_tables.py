@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
-RESULTS = Path(__file__).resolve().parent / "results"
+from cells import percent, read, table
 
 #: What the depth of a fit is, in words.
 _DEPTHS = {"none": "none", "sensor": "returns up to the cutoff", "ours": "these and dhtorch's"}
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    """Markdown of a table, numbers to the right."""
-    lines = [head, [":--", *["--:"] * (len(head) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _read(name: str) -> list[dict[str, Any]]:
-    return list(json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")))
-
-
 def readers() -> str:
     """Reader × command that wrote its file: number of sources read, of all that were tried."""
-    rows = _read("readers_3d")
+    rows = read("readers_3d")
     sources = list(dict.fromkeys(row["source"] for row in rows))
     cells = []
     for reader, writer in dict.fromkeys((row["reader"], row["written_by"]) for row in rows):
@@ -34,17 +21,17 @@ def readers() -> str:
         states = [by_source[source]["state"] if source in by_source else "–" for source in sources]
         command = "dhtorch PATH" if writer == "recover" else f"dhtorch {writer}"
         cells.append([f"{reader} {version}".strip(), f"`{command}`", *states])
-    return _table(["reader", "written by", *sources], cells)
+    return table(["reader", "written by", *sources], cells)
 
 
 def field() -> str:
     """A row for each depth that the field was fitted with."""
     cells = []
-    for row in _read("tiny_field"):
-        errors = [f"{100 * row[k]:.1f} %" for k in ("depth_pixels", "median_rel", "mean_rel", "share_within_10")]
+    for row in read("tiny_field"):
+        errors = [percent(row[k]) for k in ("depth_pixels", "median_rel", "mean_rel", "share_within_10")]
         cells.append([_DEPTHS[row["depth"]], *errors, f"{row['psnr']:.2f}"])
     head = ["depth", "rays with depth", "median error", "mean error", "within 10 %", "PSNR, dB"]
-    return _table(head, cells)
+    return table(head, cells)
 
 
 TABLES: dict[str, Callable[[], str]] = {"readers 3d": readers, "tiny field": field}

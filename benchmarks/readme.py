@@ -11,12 +11,11 @@ of docs/hooks.py says. The pages are committed whole. Pictures: docs/pictures.py
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import statistics
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +29,14 @@ import pose_tables
 import reader_tables
 import reproduce
 import speed_tables
-from cells import number, percent, table
+from cells import RESULTS, load, names_read, number, percent, read, summary_value, table, table_of_bars
 
 from dhtorch.experiments.compare import method_comparison
-from dhtorch.experiments.report import ReportTable, layouts, text
+from dhtorch.experiments.report import layouts, text
 from dhtorch.runtime import results as result_files
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
-RESULTS = HERE / "results"
 
 #: The beginning of a part that is written, and the whole of it.
 MARKER = re.compile(r"^<!-- (?!end -->)([^>]*?) -->$", re.M)
@@ -49,33 +47,18 @@ BLOCK = re.compile(r"^<!-- (?!end -->)([^>]*?) -->\n.*?^<!-- end -->$", re.M | r
 COMPARED = ("map", "auto_2", "auto")
 
 
-#: Names of the result files that the part being written has read.
-_names_read: set[str] = set()
-
-
-def read_json(path: Path) -> Any:
-    """Content of a result file, which must not be changed: many tables are of the same files."""
-    _names_read.add(path.stem)
-    return _read_json(path)
-
-
-@cache
-def _read_json(path: Path) -> Any:
-    return json.loads(path.read_text())
-
-
 def heading(method: str, result: str) -> str:
     """Heading of a method's column: ``map`` without the test of misaligned depth is that of release 1."""
     if method == "auto_2":
         return "`auto` of release 2"
-    options = read_json(RESULTS / f"{result}.json")["config"]["experiment"]["methods"].get(method)
+    options = read(result)["config"]["experiment"]["methods"].get(method)
     return "`map` of release 1" if method == "map" and options and not options.get("verify") else f"`{method}`"
 
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
     """Scene → method → row of a result file, for one truth test."""
     by_scene: dict[str, dict[str, dict[str, Any]]] = {}
-    for row in read_json(RESULTS / f"{name}.json")["rows"]:
+    for row in read(name)["rows"]:
         if row["pair"] is None and row["truth"] == truth:
             by_scene.setdefault(row["scene"], {})[row["method"]] = row
     return by_scene
@@ -90,7 +73,7 @@ def twin() -> str:
         cells += [" / ".join(percent(row[key]) for row in both) for key in ("coverage", "median_rel")]
         of_paper, of_kornia = (sum(row["ms"].values()) for row in both)
         rows.append([*cells, number(of_kornia / of_paper)])
-    summary = read_json(RESULTS / "kornia_twin.json")["summary"]
+    summary = read("kornia_twin")["summary"]
     ratios = [number(summary[f"kornia.{k}_ratio_to_paper"]["value"]) for k in ("coverage", "error")]
     rows.append(["`kornia` / `paper`, geometric mean", "", *ratios, ""])
     return table(["scene", "candidates", "coverage, `paper` / `kornia`", "median error", "time, ratio"], rows)
@@ -98,7 +81,7 @@ def twin() -> str:
 
 def chained() -> str:
     """What tracks through the frames between two views change, in one sentence."""
-    summary = read_json(RESULTS / "track_chain.json")["summary"]
+    summary = read("track_chain")["summary"]
 
     def ratios(ours: str, other: str) -> str:
         values = [number(summary[f"{ours}.{k}_ratio_to_{other}"]["value"]) for k in ("coverage", "error")]
@@ -113,18 +96,17 @@ def chained() -> str:
 
 def comparison() -> str:
     """The numbers that decide the method comparison, each beside its bar."""
-    summary = read_json(RESULTS / "method_comparison.json")["summary"]
-    rows = []
+    bars = {}
     for name, (one, many, _) in method_comparison.METHOD_BARS.items():
-        bars = f"{BOUND[name]} {one:g}" if one == many else f"{BOUND[name]} {one:g} / {many:g}"
-        cells = [f"{summary[f'{m}.{name}']['value']:.3f}" for m in COMPARED]
-        rows.append([NUMBER[name], *cells, bars])
-    return table(["number", *(heading(m, "method_comparison") for m in COMPARED), "bar"], rows)
+        bars[name] = NUMBER[name], f"{BOUND[name]} {one:g}" + f" / {many:g}" * (one != many)
+    return table_of_bars(
+        bars, {heading(m, "method_comparison"): summary_value("method_comparison", f"{m}.") for m in COMPARED}
+    )
 
 
 def chosen_views(*results: str) -> str:
     """``auto`` and that of the second release in each of some comparisons, beside its bars."""
-    summaries = [read_json(RESULTS / f"{name}.json")["summary"] for name in results]
+    summaries = [read(name)["summary"] for name in results]
     rows = []
     for name, (words, bar) in GAINS.items():
         cells = ["" if (e := s.get(f"auto.{name}")) is None else f"{e['value']:.3f}" for s in summaries]
@@ -136,8 +118,8 @@ def chosen_views(*results: str) -> str:
 
 def beside_chosen() -> str:
     """View selection where nothing can be answered, and its cost."""
-    comparison, stress = (read_json(RESULTS / f"{name}.json")["summary"] for name in ("method_comparison", "stress"))
-    timed = {r["name"]: r["ratio"] for r in read_json(RESULTS / "stream.json") if r["threads"] == 1}
+    comparison, stress = (read(name)["summary"] for name in ("method_comparison", "stress"))
+    timed = {r["name"]: r["ratio"] for r in read("stream") if r["threads"] == 1}
     turned, wrong = comparison["auto.rotation_answered"]["value"], stress["auto.convoy_wrong"]["value"]
     rows = [
         ["coverage of samples without a return where the camera only rotates", percent(turned), "≤ 0.5 %"],
@@ -152,19 +134,17 @@ def beside_chosen() -> str:
     return table(["number", "`auto`", "bar"], rows)
 
 
-def every_pixel(*results: str) -> str:
-    """The numbers that decide the dense comparison, in each of some results, beside their bars; and what it costs."""
-    summaries = [read_json(RESULTS / f"{name}.json")["summary"] for name in results]
-    timed = [r for r in read_json(RESULTS / "dense_speed.json") if r["threads"] == 1]
-    rows = []
-    for name, (words, bar) in PIXELS.items():
-        values = [s.get(name, {}).get("value") for s in summaries]
-        rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
-    for row in timed:
-        size = row["name"].removeprefix("sweep_").replace("x", "×")
-        how = "" if row["mode"] == "eager" else ", compiled code"
-        rows.append([f"time of a sweep{how}, {size}, ratio to rectification + SGBM", number(row["ratio"]), "", "≤ 1.5"])
-    return table(["number", *(f"`dense`, {name}" for name in ("shared scenes", "streams")), "bar"], rows)
+def every_pixel() -> str:
+    """The numbers that decide the dense comparison, in each of two results, beside their bars; and what it costs."""
+    columns = {"`dense`, shared scenes": summary_value("dense"), "`dense`, streams": summary_value("dense_streams")}
+    rows = [table_of_bars(PIXELS, columns)]
+    for row in read("dense_speed"):
+        if row["threads"] == 1:
+            size = row["name"].removeprefix("sweep_").replace("x", "×")
+            how = "" if row["mode"] == "eager" else ", compiled code"
+            words = f"time of a sweep{how}, {size}, ratio to rectification + SGBM"
+            rows.append(f"| {words} | {number(row['ratio'])} |  | ≤ 1.5 |")
+    return "\n".join(rows)
 
 
 def pixels_by_scene(comparison: str) -> str:
@@ -207,7 +187,7 @@ def by_scene(comparison: str) -> str:
 
 def archived_answers() -> dict[str, dict[str, Any]]:
     """Result files with a verdict: name → result."""
-    results = {path.stem: _read_json(path) for path in sorted(RESULTS.glob("*.json"))}
+    results = {path.stem: load(path) for path in sorted(RESULTS.glob("*.json"))}
     return {name: result for name, result in results.items() if isinstance(result, dict) and result.get("verdict")}
 
 
@@ -219,7 +199,7 @@ def with_others(names: Sequence[str]) -> list[dict[str, Any]]:
         for name in names
         for other in (name, *(k for k in answers if answers[k]["experiment"] == answers[name]["experiment"]))
     ]
-    _names_read.update(wanted)
+    names_read.update(wanted)
     return [answers[name] for name in dict.fromkeys(wanted)]
 
 
@@ -237,7 +217,7 @@ def verdicts(names: Sequence[str]) -> str:
         count = f"{n_scenes} / {n_pairs}" if n_scenes > 1 else f"**1** / {n_pairs}"
         question = f"`{result['experiment']}` on {result['data']['name']}"
         rows.append([question, count, result["verdict"], result["why"]])
-    return text.table_to_markdown(ReportTable("", ["experiment", "scenes / pairs", "verdict", "why"], rows, n_label=4))
+    return table(["experiment", "scenes / pairs", "verdict", "why"], rows, n_label=4)
 
 
 #: What a policy of the closed loop has beside the picture, in words.
@@ -251,7 +231,7 @@ CLOSED_LOOP = {
 
 def closed_loop() -> str:
     """Success rates of the policies in simulation."""
-    (result,) = read_json(RESULTS / "closed_loop.json")
+    (result,) = read("closed_loop")
     rows = []
     for name, words in CLOSED_LOOP.items():
         rate = result["rates"][name]
@@ -265,7 +245,7 @@ def closed_loop() -> str:
 
 def closed_loop_differences() -> str:
     """Paired differences of the success rates, in points, over the test episodes."""
-    (result,) = read_json(RESULTS / "closed_loop.json")
+    (result,) = read("closed_loop")
     rows = [
         [f"`{name}`", *(f"{100 * e[key]:+.0f}" for key in ("value", "low", "high"))]
         for name, e in result["differences"].items()
@@ -280,8 +260,8 @@ def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
 
 def how_good() -> str:
     """Coverage, errors and time of the methods on the shared scenes."""
-    sparse = read_json(RESULTS / "method_comparison.json")["summary"]
-    pixels = read_json(RESULTS / "dense.json")["summary"]
+    sparse = read("method_comparison")["summary"]
+    pixels = read("dense")["summary"]
     rows = []
     for key, words in GOOD.items():
         cells = [percent(sparse.get(f"{m}.{key}", {}).get("value")) for m in README_METHODS]
@@ -299,7 +279,7 @@ def how_good() -> str:
 
 def untouched() -> str:
     """README's one table: coverage and errors on scenes that no constant was chosen on, beside peers."""
-    samples, maps = (read_json(RESULTS / f"{name}.json") for name in ("untouched", "untouched_dense"))
+    samples, maps = (read(name) for name in ("untouched", "untouched_dense"))
     scenes = {row["scene"] for row in samples["rows"]}  # the other file has stress rooms as well
     maps["rows"] = [row for row in maps["rows"] if row["scene"] in scenes]
     columns = [(samples, m, heading(m, "untouched")) for m in UNTOUCHED_METHODS]
@@ -397,7 +377,7 @@ def loader_times() -> str:
 
 def swept() -> str:
     """The jobs of the sweep that README shows, a row each; the best of a column in bold."""
-    jobs = read_json(RESULTS / "sweep.json")
+    jobs = read("sweep")
     shown = [[number_as(job[key], key) for key in SWEPT] for job in jobs]
     for k, (key, better) in enumerate(SWEPT.items()):
         if better:
@@ -407,7 +387,7 @@ def swept() -> str:
     names = [[f"`{value}`" for value in job["overrides"].values()] for job in jobs]
     head = [*(f"`{key}`" for key in jobs[0]["overrides"]), *(HEAD[key] for key in SWEPT)]
     rows = [a + b for a, b in zip(names, shown, strict=True)]
-    return text.table_to_markdown(ReportTable("", head, rows, n_label=len(names[0])))
+    return table(head, rows, n_label=len(names[0]))
 
 
 def number_as(value: float, key: str) -> str:
@@ -423,12 +403,12 @@ HEAD |= {"coverage_at_5": "coverage at 5 % risk", "ms": "ms"}
 
 def captures() -> str:
     """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took; last the phone's."""
-    rows, files = [], (RESULTS / f"{name}.json" for name in ("captures", "phone"))
-    for record in [each for file in files for each in json.loads(file.read_text())]:
+    rows = []
+    for record in [*read("captures"), *read("phone")]:
         first = "" if record["first_s"] is None else f"{record['first_s']:.0f}"
         printed = (record.get("printed") or record.get("why") or "").removeprefix(f"{record['name']}: ")
         rows.append([printed, f"`{record['name']}`", first, f"{record['seconds']:.0f}"])
-    grid = text.table_to_markdown(ReportTable("", ["what came out", "capture", "first picture, s", "all, s"], rows))
+    grid = table(["what came out", "capture", "first picture, s", "all, s"], rows)
     shown = "".join(
         f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
         for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
@@ -438,7 +418,7 @@ def captures() -> str:
 
 def enriched() -> str:
     """Formats that ``dhtorch enrich`` wrote of each kind of source, read back value for value, and those it refuses."""
-    records = read_json(RESULTS / "enrich.json")
+    records = read("enrich")
     targets = ("lerobot v3.0", "lerobot v2.1", "nerfstudio", "the source's own")
     rows = []
     for source in sorted({record["source"] for record in records}):
@@ -490,36 +470,25 @@ VALIDATIONS = (
 
 def validated() -> str:
     """What validation finds, beside a fixed-threshold photometric check and the bars."""
-    results = {name: read_json(RESULTS / f"{name}.json") for name, _, _ in VALIDATIONS}
-    summary = {name: result["summary"] for name, result in results.items()}
-    rows = []
-    for name, (words, bar) in SCALE_ROWS.items():
-        values = []
-        for result, who, _ in VALIDATIONS:
-            key = (
-                f"validate.{name.removesuffix('_far')}_quick_far"
-                if who == "quick" and name.endswith("_far")
-                else f"{who}.{name}"
-            )
-            values.append(summary[result].get(key, {}).get("value"))
-        rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
-    shares = [
-        named_registration(results[result]["rows"]) if who == "validate" else "" for result, who, _ in VALIDATIONS
-    ]
-    rows.append(["depth that is not registered: named, all windows", *shares, ""])
-    return table(["number", *(head for _, _, head in VALIDATIONS), "bar"], rows)
-
-
-def named_registration(rows: list[dict[str, Any]]) -> str:
-    """Of the windows in which the depth is not registered, the number in which that cause was named."""
-    names = [row["named_kind"] for row in rows if row.get("planted_kind") == "registration"]
-    return f"{names.count('registration')} of {len(names)}"
+    columns, named = {}, []
+    for result, who, head in VALIDATIONS:
+        value_of = summary_value(result)
+        columns[head] = lambda name, who=who, value_of=value_of: value_of(
+            f"validate.{name.removesuffix('_far')}_quick_far"
+            if who == "quick" and name.endswith("_far")
+            else f"{who}.{name}"
+        )
+        # of the windows in which the depth is not registered, the number in which that cause was named
+        causes = [row["named_kind"] for row in read(result)["rows"] if row.get("planted_kind") == "registration"]
+        named.append(f"{causes.count('registration')} of {len(causes)}" if who == "validate" else "")
+    last = ["depth that is not registered: named, all windows", *named, ""]
+    return f"{table_of_bars(SCALE_ROWS, columns)}\n| {' | '.join(last)} |"
 
 
 def validated_real() -> str:
     """Validation of real sensors' own depth."""
     rows = []
-    for row in read_json(RESULTS / "validate_real.json"):
+    for row in read("validate_real"):
         whole, limited = row["whole"], row["whole"]["limited"]
         wrong = "unknown" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
@@ -558,13 +527,6 @@ PINNED = {
 }
 
 
-def pinned() -> str:
-    """What a pinned camera reaches, beside its bars."""
-    summary = read_json(RESULTS / "pin_study.json")["summary"]
-    rows = [[words, f"{summary[f'pin.{name}']['value']:.3f}", bar] for name, (words, bar) in PINNED.items()]
-    return table(["number", "`pin_study`", "bar"], rows)
-
-
 #: What alignment is to reach, in words, and its bars.
 ALIGNED = {
     "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
@@ -575,19 +537,15 @@ ALIGNED = {
 }
 
 
-def aligned(*results: str) -> str:
+def aligned() -> str:
     """What alignment reaches, of several results, beside its bars."""
-    results = [read_json(RESULTS / f"{name}.json") for name in results]
-    rows = [
-        [words, *(f"{result['summary'][f'align.{name}']['value']:.3f}" for result in results), bar]
-        for name, (words, bar) in ALIGNED.items()
-    ]
-    seeds = [result["config"]["data"].get("seed") for result in results]
-    names = [
-        f"`{result['data']['name']}`" + (f", seeds {seed[0]} to {seed[-1]}" if seed else "")
-        for result, seed in zip(results, seeds, strict=True)
-    ]
-    return table(["number", *names, "bar"], rows)
+    columns = {}
+    for name in ("", "_streams", "_rooms", "_unseen", "_unseen_2", "_unseen_3"):
+        result = read(f"align_study{name}")
+        seed = result["config"]["data"].get("seed")
+        seeds = f", seeds {seed[0]} to {seed[-1]}" if seed else ""
+        columns[f"`{result['data']['name']}`{seeds}"] = summary_value(f"align_study{name}", "align.")
+    return table_of_bars(ALIGNED, columns)
 
 
 #: What the scale of a model is to reach, in words, and its bars.
@@ -612,16 +570,9 @@ SCALED = {
 }
 
 
-def scaled() -> str:
-    """What the scale of a model reaches, beside its bars."""
-    result = read_json(RESULTS / "scale_study.json")["summary"]
-    rows = [[words, f"{result[f'scale.{name}']['value']:.3f}", bar] for name, (words, bar) in SCALED.items()]
-    return table(["number", "measured", "bar"], rows)
-
-
 def caught() -> str:
     """Faults drawn by rule that a test caught, by group of packages."""
-    rows = read_json(RESULTS / "mutants.json")
+    rows = read("mutants")
     seed = rows[0]["seed"]
     cells = [[name, f"{n} of {of}", f"{n / of:.0%}"] for name, n, of in mutants.summarize(rows) if name[0] != "`"]
     return table([f"faults drawn with the seed `{seed}` in", "caught", "fraction"], cells)
@@ -629,52 +580,34 @@ def caught() -> str:
 
 def lerobot_trained() -> str:
     """Commands of LeRobot by set and version: passed, failed and why, or not run."""
-    file = RESULTS / "lerobot_train.json"
-    if not file.is_file():
-        return "Not run yet: `benchmarks/results/lerobot_train.json` is not there."
-    rows = json.loads(file.read_text())
+    rows = read("lerobot_train")
     versions = sorted({row["lerobot"] for row in rows})
     found = {(row["set"], row["command"], row["lerobot"]): row for row in rows}
     cells = []
     for name, command in dict.fromkeys((row["set"], row["command"]) for row in rows):
         each = [found.get((name, command, version), {"passed": None, "why": "not run"}) for version in versions]
         about = next(row["about"] for row in rows if row["set"] == name)
-        said = ["passed" if row["passed"] else row["why"].replace("|", "/") for row in each]
+        outcomes = ["passed" if row["passed"] else row["why"].replace("|", "/") for row in each]
         shown = f"`--policy.type={command}`" if command in ("act", "diffusion") else command
-        cells.append([name, about, shown, *said])
+        cells.append([name, about, shown, *outcomes])
     return table(["set", "with", "command", *(f"LeRobot {version}" for version in versions)], cells)
 
 
 def faults_of_captures() -> str:
     """Planted faults of captures: outcomes by fault, over windows and layouts."""
-    rows = [row for row in read_json(RESULTS / "capture_faults.json") if row["counted"]]
+    rows = [row for row in read("capture_faults") if row["counted"]]
+    kinds = {"right": "read right", "refused": "refused", "named": "named", "otherwise": "other warning"}
+    kinds |= {"unchecked": "stated as unchecked", "silent": "not detected", "alarm": "false alarm"}
     cells = []
     for fault in dict.fromkeys(row["fault"] for row in rows):
         outcomes = [row["outcome"] for row in rows if row["fault"] == fault]
-        counts = [
-            str(outcomes.count(x) or "")
-            for x in ("right", "refused", "named", "otherwise", "unchecked", "silent", "alarm")
-        ]
-        cells.append([f"`{fault}`", str(len(outcomes)), *counts])
-    return table(
-        [
-            "fault",
-            "captures",
-            "read right",
-            "refused",
-            "named",
-            "other warning",
-            "stated as unchecked",
-            "not detected",
-            "false alarm",
-        ],
-        cells,
-    )
+        cells.append([f"`{fault}`", str(len(outcomes)), *(str(outcomes.count(kind) or "") for kind in kinds)])
+    return table(["fault", "captures", *kinds.values()], cells)
 
 
 def sensitivities() -> str:
     """Options whose half or twice value changes coverage or median error most, and those that change neither."""
-    rows = read_json(RESULTS / "sensitivity.json")
+    rows = read("sensitivity")
     numbers = ("coverage", "median_rel")
     cells = []
     for row in rows:
@@ -696,17 +629,13 @@ TABLES |= {"kornia twin": twin, "track chain": chained}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {
     "validate": validated,
-    "pin": pinned,
+    "pin": lambda: table_of_bars(PINNED, {"`pin_study`": summary_value("pin_study", "pin.")}),
     "validate real": validated_real,
     "lerobot train": lerobot_trained,
-    "scale": scaled,
-    "align": partial(
-        aligned,
-        *("align_study", "align_study_streams", "align_study_rooms"),
-        *("align_study_unseen", "align_study_unseen_2", "align_study_unseen_3"),
-    ),
+    "scale": lambda: table_of_bars(SCALED, {"measured": summary_value("scale_study", "scale.")}),
+    "align": aligned,
 }
-TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
+TABLES |= {"every pixel": every_pixel}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
     {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
@@ -795,7 +724,7 @@ TABLES |= {name: partial(with_verdicts, TABLES[name], *results) for name, result
 
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
-    _names_read.add(name)
+    names_read.add(name)
     tables = layouts.layout_tables(result_files.read_result(RESULTS / f"{name}.json"))
     if not tables:
         raise ValueError(f"{RESULTS / name}.json: found an experiment without tables of its own, expected a known one")
@@ -835,7 +764,7 @@ def fill(page: Path) -> str:
 
 def _written(name: str) -> str:
     """The part of a page that a marker names, and a note on its files with the settings of an earlier release."""
-    _names_read.clear()
+    names_read.clear()
     part = maker(name)()
     if name == "make: experiments":  # of docs/hooks.py, with every archived answer
         _names_read.update(archived_answers())
@@ -843,7 +772,7 @@ def _written(name: str) -> str:
     files = ", ".join(f"`{each}.json`" for each in old)
     note = f"\n\n*Made with the settings of an earlier release, not of this one: {files}. "
     note += f"`python benchmarks/reproduce.py {' '.join(old)}` makes them again.*"
-    return part + note if old else part
+    return part + note * bool(old)
 
 
 def pages() -> list[Path]:

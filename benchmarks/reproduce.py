@@ -13,6 +13,7 @@ Experiments read real sequences from DHTORCH_DATA. Speeds are only worth somethi
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -25,13 +26,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from cells import RESULTS, collection_of, write_collection
+
 from dhtorch.cli.run import config_dir, job_name
 from dhtorch.runtime import code_dependencies as code
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 HERE = Path(__file__).resolve().parent
-RESULTS = HERE / "results"
 
 #: Comparisons without the methods that take tens of seconds a pair; kornia's numbers: ``kornia_twin``, ``track_chain``.
 WITHOUT_SLOW = "~method@experiment.methods.kornia ~method@experiment.methods.xfeat experiment.once=[opencv]"
@@ -101,7 +103,7 @@ EXPERIMENTS = {
 }
 
 #: Result of a script of this folder → its arguments.
-SCRIPTS = dict.fromkeys(("triangulate", "scaling", "readers"), "")
+SCRIPTS = dict.fromkeys(("triangulate", "scaling"), "")
 SCRIPTS["loader_workers0"] = "--workers 0"
 SCRIPTS |= {
     **dict.fromkeys(("frontend", "lk", "pnp"), "--clock cpu --repeats 5"),
@@ -111,7 +113,6 @@ SCRIPTS |= {
     "dense_speed": "--clock cpu --repeats 5",
     "start": "--clock cpu --repeats 3",
     "waterfall": "--clock cpu --repeats 5",
-    "degenerate": "",
     "sensitivity": "",
     "capture_faults": "",
     "mutants": "300 --lines lines.json",  # written by `mutants.py --record lines.json` on the same commit
@@ -120,7 +121,6 @@ SCRIPTS |= {
     "xfeat_noise": "",
     "sweep": "",
     "captures": "--pictures docs/assets/captures",
-    "first_picture": "--first holo_a",
     "memory": "",
     "phone": "",
     "enrich": "",
@@ -145,14 +145,12 @@ SCRIPTS |= {
     "closed_loop": "",  # mujoco installed
 }
 
-#: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in
-#: a worker (in which the loader is measured anyway).
-AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed"), "kept": ("lk", "pair", "dense_speed")}
+#: Speeds again: with the vectors of processors that lack AVX-512.
+AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed")}
 SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names in AGAIN.items() for name in names}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {
-    "first_picture": "captures",
     "kornia": "beside_kornia",
     "loader_workers0": "loader",
     "dense_speed": "dense",
@@ -266,22 +264,31 @@ def reachable(name: str, root: Path = HERE.parent) -> dict[str, Path]:
 
 def check(name: str) -> str:
     """Why a committed file is not what its command would give today; empty where nothing speaks against it."""
-    path = RESULTS / f"{name}.json"
-    if not path.is_file():
-        return f"no {path.name}"
+    content = digest_content(name)
+    if content is None:
+        return f"no {name}.json"
     made, options = provenance().get(name, {}), other_settings(name)
     if options:
         shown = ", ".join(option.partition(":")[0] for option in options[:3])
-        return f"{path.name}: {len(options)} other options ({shown}{', …' if len(options) > 3 else ''})"
-    if made.get("file") != storage.compute_file_digest(path):
-        return f"{path.name}: made without this script, neither its commit nor its code is recorded"
+        return f"{name}: {len(options)} other options ({shown}{', …' if len(options) > 3 else ''})"
+    if made.get("content") != content:
+        return f"{name}: made without this script, neither its commit nor its code is recorded"
     if made["code"] != code.compute_code_digest(reachable(name)):
-        return f"{path.name}: other code than that of {made['commit']}"
+        return f"{name}: other code than that of {made['commit']}"
     return ""
 
 
+def digest_content(name: str) -> str | None:
+    """SHA-256 of a result, which is a file or a part of a collection; None where there is none."""
+    path, collection = (RESULTS / f"{each}.json" for each in (name, collection_of(name)))
+    if path.is_file():
+        return storage.compute_file_digest(path)
+    parts = json.loads(collection.read_text(encoding="utf-8")) if collection.is_file() else {}
+    return hashlib.sha256(json.dumps(parts[name]).encode()).hexdigest() if name in parts else None
+
+
 def provenance() -> dict[str, Any]:
-    """Result -> ``{commit, code, file}``; of a renewed one also ``renewed``, the commit, and ``by``, the comparison."""
+    """Result -> ``{commit, code, content}``; of a renewed one also ``renewed``, the commit, and ``by``, the comparison."""
     return json.loads(PROVENANCE.read_text()) if PROVENANCE.is_file() else {}
 
 
@@ -290,7 +297,7 @@ def note(name: str, **more: str) -> None:
     made = {
         "commit": result_files.read_git_revision(HERE.parent / "dhtorch"),
         "code": code.compute_code_digest(reachable(name)),
-        "file": storage.compute_file_digest(RESULTS / f"{name}.json"),
+        "content": digest_content(name),
     }
     storage.write_json(PROVENANCE, dict(sorted({**provenance(), name: {**made, **more}}.items())))
 
@@ -348,20 +355,28 @@ def first_scene(name: str, root: Path, output: Path) -> list[dict[str, Any]] | N
     return [{k: v for k, v in row.items() if k != "ms"} for row in rows]
 
 
-#: Experiments of whose single pairs a page reads numbers; of the others it only counts them.
-PAIR_ROWS_READ = {"validate_study"}
-
-_IDENTITY = ("scene", "pair", "method", "truth", "role", "note")
+#: Numbers in groups, curves and points on images, which no page reads.
+_DETAIL = {"overlay", "curves", "gate_share", "hole_share", "ms", "apart", "bias_bins"}
+#: Experiment → those of its scenes that a page or a figure reads.
+_DETAIL_READ = {"method_comparison": {"curves", "ms"}, "hole_census": {"hole_share"}}
+#: Experiment → numbers of its single pairs that a page reads; of the others the scenes alone are committed.
+_PAIRS_READ = {"validate_study": {"named_kind", "planted_kind", "baseline"}}
+_PAIRS_READ["validate_study"] |= {f"quick_far.{fault}" for fault in ("none", "10_long", "10_short")}
 
 
 def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
-    """A result as it is committed, without what no page reads: numbers of single pairs and overlays on pictures."""
-
-    def kept(row: Mapping[str, Any]) -> dict[str, Any]:
-        counted = row["pair"] is not None and result["experiment"] not in PAIR_ROWS_READ
-        return {k: v for k, v in row.items() if (k in _IDENTITY if counted else k != "overlay")}
-
-    return {**result, "rows": [kept(row) for row in result["rows"]]}
+    """A result as it is committed, without what no page reads: single pairs, groups of numbers, points on images."""
+    left_out = _DETAIL - _DETAIL_READ.get(result["experiment"], set())
+    of_pair = {"scene", "pair", "method", "truth"} | _PAIRS_READ.get(result["experiment"], set())
+    of_scenes = [row for row in result["rows"] if row["pair"] is None]
+    some_pairs = [row for row in result["rows"] if row["pair"] is not None and result["experiment"] in _PAIRS_READ]
+    rows = [{k: v for k, v in row.items() if k not in left_out} for row in of_scenes or result["rows"]]
+    rows += [{k: v for k, v in row.items() if k in of_pair} for row in some_pairs]
+    for row in rows:
+        if "curves" in row:
+            row["curves"] = {"risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk")}}
+    summary = {k: v for k, v in result["summary"].items() if not left_out & set(k.split("."))}
+    return {**result, "rows": rows, "summary": summary}
 
 
 def run(name: str, further: str = "", target: Path = RESULTS) -> bool:
@@ -371,6 +386,11 @@ def run(name: str, further: str = "", target: Path = RESULTS) -> bool:
     if name in SCRIPTS:
         words = [sys.executable, *command(name).split()[1:-1], str(path)]
         done = subprocess.run(words, cwd=HERE.parent, check=False)
+        collection = target / f"{collection_of(name)}.json"
+        if path != collection and path.is_file():  # becomes a part of its collection
+            parts = json.loads(collection.read_text(encoding="utf-8")) if collection.is_file() else {}
+            write_collection(collection, {**parts, name: json.loads(path.read_text(encoding="utf-8"))})
+            path.unlink()
     else:
         with tempfile.TemporaryDirectory() as folder:
             words = [*command(name).split()[1:], *further.split(), f"output={folder}"]

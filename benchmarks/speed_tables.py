@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+from cells import COLLECTIONS, read, table
 from reproduce import AGAIN
-
-from dhtorch.experiments.report import ReportTable, text
-
-RESULTS = Path(__file__).resolve().parent / "results"
 
 #: File, row, bar (None where none was set) and words of the table of speeds: compiled where there is an operator.
 BARS = (
@@ -50,10 +45,8 @@ SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader", "validate_s
 
 def timings(file: str) -> list[dict[str, Any]]:
     """Rows of a benchmark's result file; none where it was not made again otherwise."""
-    path = RESULTS / f"{file}.json"
     again = file.endswith(tuple(f"_{how}" for how in AGAIN))
-    rows: list[dict[str, Any]] = [] if again and not path.is_file() else json.loads(path.read_text())
-    return rows
+    return [] if again and file not in COLLECTIONS["speeds"] else list(read(file))
 
 
 def ratio(value: float) -> str:
@@ -111,7 +104,7 @@ def bars() -> str:
         "errors, ours / peer",
         "on, code of",
     ]
-    return text.table_to_markdown(ReportTable("", head, rows))
+    return table(head, rows)
 
 
 def stages() -> str:
@@ -126,7 +119,7 @@ def stages() -> str:
                 cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
             shown.append([*cells, f"{r['peer_ms']:.1f}"])
     head = ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"]
-    return on("pair", text.table_to_markdown(ReportTable("", head, shown)))
+    return on("pair", table(head, shown))
 
 
 def scaling() -> str:
@@ -139,7 +132,7 @@ def scaling() -> str:
             cells = [str(r["n"]), f"{r['ours_ms']:.1f}", "–" if r["peak_mib"] is None else f"{r['peak_mib']:.0f}"]
             rows.append([f"`{name}`", *grows, *cells])
     head = ["what doubles", "time ^", "memory ^", "largest size", "ms there", "MiB above the inputs there"]
-    return on("scaling", text.table_to_markdown(ReportTable("", head, rows)))
+    return on("scaling", table(head, rows))
 
 
 def waterfall() -> str:
@@ -159,7 +152,7 @@ def waterfall() -> str:
             rows.append([part, *shown])
     rows.append(["whole call", *(f"{next(iter(by_part.values()))['peer_ms']:,.1f}" for by_part in shares.values())])
     head = ["ms (share)", *(f"`{call}`" for call in shares)]
-    return on("waterfall", text.table_to_markdown(ReportTable("", head, rows)))
+    return on("waterfall", table(head, rows))
 
 
 def memory() -> str:
@@ -169,7 +162,7 @@ def memory() -> str:
         for r in timings("memory")
     ]
     head = ["frames", "peak, MiB", "after", "then, MiB more", "bar"]
-    return on("memory", text.table_to_markdown(ReportTable("", head, rows)))
+    return on("memory", table(head, rows))
 
 
 def accelerator() -> str:
@@ -192,7 +185,7 @@ def accelerator() -> str:
     head = ["call", "at once", "ms", "replayed, ms", "kornia, ms", "CPU, ms", "a second, at best", "peak, MiB", "waits"]
     head += ["errors, device / CPU", "other gates / change in sigmas"]
     cards = sorted({f"{r['card']}, torch {r['torch']}" for r in timings("gpu")})
-    return f"{text.table_to_markdown(ReportTable('', head, rows))}\n\nDevice: {'; '.join(cards)}. CPU beside it: " + (
+    return f"{table(head, rows)}\n\nDevice: {'; '.join(cards)}. CPU beside it: " + (
         f"{timings('gpu')[0]['processor']}, {timings('gpu')[0]['threads']} threads{code(timings('gpu'))}."
     )
 

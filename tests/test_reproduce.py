@@ -5,6 +5,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,17 +13,44 @@ from dhtorch.runtime import results as result_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import cells
 import readme
 import reproduce
 import speed_tables
 
 REPO = Path(__file__).resolve().parents[1]
-RESULTS = {path.stem for path in (REPO / "benchmarks/results").glob("*.json")}
+FILES = {path.stem for path in (REPO / "benchmarks/results").glob("*.json")}
 PAGES = ("README.md", "benchmarks/README.md", *sorted(str(p.relative_to(REPO)) for p in REPO.glob("docs/**/*.md")))
 
 
 def test_every_result_has_a_command_and_every_command_its_result():
-    assert {*reproduce.EXPERIMENTS, *reproduce.SCRIPTS} == RESULTS
+    parts = {name for file in cells.COLLECTIONS for name in cells.load(cells.RESULTS / f"{file}.json")}
+    assert {*reproduce.EXPERIMENTS, *reproduce.SCRIPTS} == FILES - set(cells.COLLECTIONS) | parts
+    assert parts == {name for names in cells.COLLECTIONS.values() for name in names} and not parts & FILES
+
+
+def test_what_a_script_makes_again_becomes_a_part_of_its_collection(tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
+    cells.write_collection(tmp_path / "speeds.json", {"lk": [{"a": "é"}], "pnp": []})
+    (tmp_path / "lk.json").write_text('[{"a": 1}, {"a": null}]')
+    monkeypatch.setattr(reproduce.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
+    assert reproduce.run("lk") and not (tmp_path / "lk.json").exists()
+    assert json.loads((tmp_path / "speeds.json").read_text()) == {"lk": [{"a": 1}, {"a": None}], "pnp": []}
+
+
+def test_a_result_is_committed_without_what_no_page_reads():
+    names = {"scene": "a", "method": "map", "truth": "full"}
+    curves = {"risk_coverage": {"coverage": [1], "risk": [2], "oracle": [3]}, "distance": {}}
+    scene = {**names, "pair": None, "coverage": 0.5, "overlay": 1, "curves": curves, "ms": {}}
+    pair = {**names, "pair": [0, 1], "coverage": 0.5, "named_kind": "unit"}
+    summary = {"map.coverage": 1, "map.ms.track": 2, "map.apart.glass.coverage": 3}
+    whole = {"experiment": "heldout", "rows": [scene, pair], "summary": summary}
+    kept = {k: v for k, v in scene.items() if k not in ("overlay", "curves", "ms")}
+    assert reproduce.without_detail(whole) == {**whole, "rows": [kept], "summary": {"map.coverage": 1}}
+    compared = reproduce.without_detail({**whole, "experiment": "method_comparison"})["rows"]
+    assert compared == [{**kept, "ms": {}, "curves": {"risk_coverage": {"coverage": [1], "risk": [2]}}}]
+    validated = reproduce.without_detail({**whole, "experiment": "validate_study"})["rows"]
+    assert validated == [kept, {k: v for k, v in pair.items() if k != "coverage"}]
 
 
 @pytest.mark.parametrize(("part", "names"), [("kornia twin", {"kornia_twin"}), ("pin", set())])
@@ -88,8 +116,8 @@ def test_commands_on_the_pages_are_those_that_made_the_results(page):
 
 
 def test_a_speed_is_told_with_its_processor():
-    for name in (*speed_tables.SCRIPTS, "scaling", "readers"):
-        rows = json.loads((REPO / f"benchmarks/results/{name}.json").read_text())
+    for name in (*speed_tables.SCRIPTS, "scaling"):
+        rows = cells.read(name)
         named = {row.get("processor") for row in rows}
         assert len(named) == 1 and None not in named, name
         assert named.pop() in speed_tables.on(name, "")

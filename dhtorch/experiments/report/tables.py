@@ -130,17 +130,20 @@ def scene_table(
     order = list(dict.fromkeys(row["scene"] for row in result["rows"]))
     n_label = 1 + (len(variant_names(result)) > 1)
     pairs = [(r["scene"], r["method"]) for r in result["rows"] if r["pair"] is not None and r.get("truth") == truth]
+
+    def count_pairs(row: Row) -> int:  # an archived result may lack the rows of its pairs
+        return pairs.count((row["scene"], row["method"])) if pairs else row.get("n_pairs") or 0
+
     body, footer = [], []
     for row in sorted(rows, key=lambda row: order.index(row["scene"])):
         cells = [format_value(metric_value(row, m), m) for m in columns]
         cells = [row["note"] if cell == EMPTY_CELL and row.get("note") else cell for cell in cells]
-        n_pairs = str(pairs.count((row["scene"], row["method"])))
-        body.append([*(scene_label(row), row["method"])[:n_label], n_pairs, *cells])
+        body.append([*(scene_label(row), row["method"])[:n_label], str(count_pairs(row)), *cells])
     for method in dict.fromkeys(row["method"] for row in rows if not row.get("role")):
         counted = [row for row in rows if row["method"] == method and not row.get("role")]
         n, n_skipped = len(counted), sum(bool(row.get("note")) for row in counted)
         n_scenes = f"{n - n_skipped} of {format_count(n, 'scene')}" if n_skipped else format_count(n, "scene")
-        n_pairs = str(sum(pairs.count((row["scene"], method)) for row in counted))
+        n_pairs = str(sum(map(count_pairs, counted)))
         cells = [_number_over_scenes(result, method, m, truth) for m in columns]
         footer.append([*(n_scenes, method)[:n_label], n_pairs, *cells])
         entries = {m: {} if m in DERIVED_NUMBERS else summary_entry(result, method, m, truth) for m in columns}
