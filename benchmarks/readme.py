@@ -767,8 +767,8 @@ def _written(name: str) -> str:
     names_read.clear()
     part = maker(name)()
     if name == "make: experiments":  # of docs/hooks.py, with every archived answer
-        _names_read.update(archived_answers())
-    old = sorted(name for name in _names_read if reproduce.other_settings(name))
+        names_read.update(archived_answers())
+    old = sorted(name for name in names_read if reproduce.other_settings(name))
     files = ", ".join(f"`{each}.json`" for each in old)
     note = f"\n\n*Made with the settings of an earlier release, not of this one: {files}. "
     note += f"`python benchmarks/reproduce.py {' '.join(old)}` makes them again.*"

@@ -114,12 +114,38 @@ def test_low_resolution_depth_is_taken_at_its_own_pixel_centres():
     assert beside[flat].median() > 10 * error[flat].median(), "half a pixel off is seen"
 
 
-def test_exact_and_absent_sensor():
+def test_options_do_what_they_say():
     exact = SyntheticRoom(n_frames=1, lidar="exact", **SMALL)
     assert torch.equal(exact[0].depth, exact.truth(0)["depth"])
     assert (exact[0].conf == 2).all() and exact[0].depth.shape == (1, 120, 160)
-    none = SyntheticRoom(n_frames=1, lidar=None, **SMALL)
+    none = SyntheticRoom(n_frames=1, lidar=None, image_noise=0.0, **SMALL)
     assert (none[0].depth == 0).all() and (none[0].conf == 0).all()
+    clean, noisy = none[0].image.double(), SyntheticRoom(n_frames=1, image_noise=3.0, **SMALL)[0].image.double()
+    assert 2.8 < (noisy - clean)[(clean > 20) & (clean < 235)].std() < 3.2
+    other = SyntheticRoom(seed=1, n_frames=1, image_noise=0.0, **SMALL)
+    assert (clean - other[0].image).abs().mean() > 5
+    assert not torch.equal(none.truth(0)["depth"], other.truth(0)["depth"])
+    assert not torch.equal(none.poses.t, other.poses.t)
+
+
+@pytest.mark.parametrize(
+    ("make", "wrong", "message"),
+    [
+        (open_room, {"near": 0}, "near is 0"),
+        (open_room, {"gap": 0}, "gap is 0, expected a positive"),
+        (open_room, {"seeed": 2}, "found option 'seeed'"),
+        (SyntheticRoom, {"path": "jump"}, "path"),
+        (SyntheticRoom, {"lidar": "radar"}, "lidar"),
+        (SyntheticRoom, {"n_frames": 0}, "n_frames"),
+        (SyntheticRoom, {"hw": (0, 4)}, "hw"),
+        (SyntheticRoom, {"range_limit": -1.0}, "range_limit"),
+        (lambda **frame: SyntheticRoom(n_frames=2, **SMALL).truth(frame["i"]), {"i": 2}, "2"),
+        (lambda **frame: SyntheticRoom(n_frames=2, **SMALL).truth(frame["i"]), {"i": -3}, "-3"),
+    ],
+)
+def test_wrong_options_and_frames_that_are_not_there_are_named(make, wrong, message):
+    with pytest.raises((ValueError, IndexError), match=message):
+        make(**wrong)
 
 
 @pytest.mark.slow
@@ -157,13 +183,6 @@ def test_number_of_threads_changes_no_bit():
     assert 4 * seen[0][1][0, 0].numel() > shared_out, "picture: four rays in every pixel at a time"
     for one, two in zip(*seen, strict=True):
         assert torch.equal(one, two)
-
-
-def test_another_seed_is_another_room():
-    a, b = (SyntheticRoom(seed=s, n_frames=1, **SMALL) for s in (2, 1))
-    assert (a[0].image.int() - b[0].image.int()).abs().double().mean() > 5
-    assert not torch.equal(a.truth(0)["depth"], b.truth(0)["depth"])
-    assert not torch.equal(a.poses.t, b.poses.t)
 
 
 def lidar(room, seed=0, **options):
@@ -261,15 +280,6 @@ def test_paths_stay_in_the_room_and_keep_their_word(path):
         assert along[0].abs() > 0.95 if path == "lateral" else along[2] > 0.95
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [({"near": 0}, "near is 0"), ({"gap": 0}, "gap is 0, expected a positive"), ({"seeed": 2}, "found option 'seeed'")],
-)
-def test_a_scene_of_the_room_with_wrong_notes(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        open_room(**SMALL, **wrong)
-
-
 def test_every_default_frame_has_a_near_and_a_far_part():
     scene = open_room(**SMALL)
     room = scene.recording
@@ -301,30 +311,9 @@ def test_picture_is_antialiased():
     assert (usual - fine).square().mean() < 0.5 * (coarse - fine).square().mean()
 
 
-def test_image_noise_has_the_size_asked_for():
-    clean, noisy = (SyntheticRoom(n_frames=1, image_noise=s, **SMALL)[0].image.double() for s in (0.0, 3.0))
-    middle = (clean > 20) & (clean < 235)
-    assert 2.8 < (noisy - clean)[middle].std() < 3.2
-
-
 def test_all_kinds_of_surface_are_in_view(room):
     surface = room.truth(0)["surface"]
     for kind in (SURFACE_MIRROR, SURFACE_WINDOW, SURFACE_DARK):
         assert (surface == kind).double().mean() > 0.01
     image = room[0].image.double().mean(1)
     assert image[surface == SURFACE_DARK].mean() < 40 and image[surface == SURFACE_WINDOW].mean() > 180
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"path": "jump"}, {"lidar": "radar"}, {"n_frames": 0}, {"hw": (0, 4)}, {"range_limit": -1.0}]
-)
-def test_wrong_options_name_the_option(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SyntheticRoom(**wrong)
-
-
-def test_index_out_of_range():
-    room = SyntheticRoom(n_frames=2, **SMALL)
-    for i in (2, -3):
-        with pytest.raises(IndexError):
-            room.truth(i)
