@@ -288,7 +288,7 @@ def digest_content(name: str) -> str | None:
 
 
 def provenance() -> dict[str, Any]:
-    """Result -> ``{commit, code, content}``; of a renewed one also ``renewed``, a commit, and ``by``, the comparison."""
+    """Result -> ``{commit, code, content}``; of a renewed one also ``renewed``, a commit, and ``by``, a comparison."""
     return json.loads(PROVENANCE.read_text()) if PROVENANCE.is_file() else {}
 
 

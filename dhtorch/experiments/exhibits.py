@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from dhtorch.codes import Cause, Source, is_estimated
-from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.protocol import Answer, Method, Progress, Protocol, ScenePairs, Settings, Variant
@@ -22,7 +21,7 @@ from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.view_report import report_selection
-from dhtorch.records import Camera, DepthMap, Frame, Pose, SigmaBudget
+from dhtorch.records import Camera, DepthMap, Frame, Pose
 from dhtorch.viz.viewer.exhibit import (
     EMPTY_CLOUD,
     EMPTY_SWEPT_CLOUD,
@@ -39,12 +38,6 @@ MAX_CLOUD_POINTS = 12_000
 
 #: Maximum number of swept and filled pixels that are shown of one view, in rows and columns evenly spaced.
 MAX_SWEPT_POINTS = 24_000
-
-#: Maximum of the longer side of the images, px.
-_MAX_SIDE_PX = 800
-
-#: Quality of their JPEG files.
-_JPEG_QUALITY = 82
 
 
 def make_exhibit(
@@ -64,7 +57,7 @@ def make_exhibit(
         method: of one source view or several.
         pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (reference view, other).
         settings: cutoff, seed, device, batch, workers.
-        most: maximum number of pairs; of more, as many evenly spaced.
+        most: maximum number of pairs; of more, as many evenly spaced, the first and the last included.
         sweep: adds a dense map of the reference views.
         progress: wraps the loop over the pairs.
 
@@ -80,14 +73,19 @@ def make_exhibit(
         batch = answer.batch
         for k, frame in ((batch.pairs[0][0], batch.reference), answer.other):
             if k not in views:
-                views[k] = _make_view(recording, k, frame)
+                time = None if recording.times is None else float(recording.times[k] - recording.times[0])
+                jpeg = _encode_jpeg(_image_uint8(frame))
+                views[k] = ExhibitView(int(recording.number[k]), time, *jpeg, frame.hw, *_intrinsics(frame.camera))
         pair_exhibits.append(_make_pair_exhibit(answer, list(views)))
         return {}
 
+    def choose(scene: Scene) -> list[Any]:
+        found = list(pairs(scene))
+        last, n = len(found) - 1, min(most, len(found))
+        return [found[k] for k in sorted({round(i * last / max(n - 1, 1)) for i in range(n)})]
+
     viewer_protocol = Protocol({"view": Variant(method, estimate=sweep, chooses=True)}, columns=keep, min_candidates=0)
-    protocol.run(
-        [shown_scene], viewer_protocol, lambda scene: _evenly_spaced(pairs(scene), most), settings, progress=progress
-    )
+    protocol.run([shown_scene], viewer_protocol, choose, settings, progress=progress)
     path = None if recording.poses is None else recording.poses.t.detach().cpu().numpy()
     return Exhibit(recording.name, pair_exhibits, list(views.values()), path)
 
@@ -96,14 +94,15 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
     batch, samples, estimate = answer.batch, answer.samples, answer.estimate
     tracks, fit, truth = answer.trace["tracks"], answer.trace["fit"], list(answer.truths.values())[-1]
     whole, reference, i, j = merge(samples, estimate), batch.reference, batch.pairs[0].reference, answer.other[0]
-    filled = whole.source != Source.NONE
+    # the largest cause of sigma; of a return the reference
+    cause = torch.where(whole.source == Source.NONE, Cause.NONE, estimate.budget.dominating)
     xyz = cam.unproject(reference.camera, whole.uv, whole.depth)
     error = (estimate.depth - truth.depth).abs() / truth.depth.clamp_min(1e-9)
     columns = {
         "uv_0": whole.uv,
         "uv_1": tracks.uv_1,
         "tracked": tracks.valid,
-        "xyz": torch.where(filled[..., None], xyz, torch.nan),
+        "xyz": torch.where((whole.source != Source.NONE)[..., None], xyz, torch.nan),
         "rgb": _sample_colours(reference, whole.uv),
         **{name: getattr(whole, name) for name in ("depth", "sigma", "score", "source")},
         "gate": estimate.gate,
@@ -112,9 +111,10 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
         "residual_px": estimate.residual_px,
         "error": torch.where(truth.ok & estimate.keep, error, torch.nan),
         "candidate": truth.ok,
-        "cause": _largest_cause(whole.source, estimate.budget),
+        "cause": torch.where(whole.source == Source.SENSOR, Cause.REFERENCE, cause),
     }
-    T_world_from_0 = _in_world(reference)
+    pose = reference.T_world_from_cam
+    T_world_from_0 = np.eye(4) if pose is None else _pose_matrix(pose)
     held_back = reference.replace(depth=batch.exact.depth, depth_camera=batch.exact.depth_camera)
     ok = bool(fit.ok[0])
     cutoff = batch.cutoff if batch.cutoff is not None else float("inf")
@@ -124,6 +124,8 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
         facts["baseline"] = f"{100 * float(fit.T_1_from_0.t.norm()):.1f} cm"
     if offered := batch.pairs[0].candidates:
         facts["views"] = str(report_selection(i, offered, answer.trace)).partition(": ")[2]
+    depth = reference.depth[0].cpu()
+    shown_depth = torch.where(depth <= cutoff, depth, 0.0).float().numpy()
     return PairExhibit(
         label=f"{i} → {j}",
         samples={name: x[0].detach().cpu().numpy() for name, x in columns.items()},
@@ -134,22 +136,8 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
         seen=_return_cloud(reference, (reference.depth > 0) & (reference.depth <= cutoff)),
         held_out=_return_cloud(held_back, held_back.depth > cutoff),
         swept=_swept_cloud(reference, answer.trace["dense"]) if "dense" in answer.trace else EMPTY_SWEPT_CLOUD,
-        depth_image=_depth_image(reference, cutoff),
+        depth_image=DepthImage(shown_depth, *_intrinsics(_depth_camera(reference))),
         facts=facts,
-    )
-
-
-def _make_view(recording: Recording, k: int, frame: Frame) -> ExhibitView:
-    time = None if recording.times is None else float(recording.times[k] - recording.times[0])
-    return ExhibitView(
-        int(recording.number[k]), time, *_encode_jpeg(_image_uint8(frame)), frame.hw, *_focal_and_centre(frame.camera)
-    )
-
-
-def _depth_image(frame: Frame, cutoff: float) -> DepthImage:
-    depth = frame.depth[0].cpu()
-    return DepthImage(
-        torch.where(depth <= cutoff, depth, 0.0).float().numpy(), *_focal_and_centre(_depth_camera(frame))
     )
 
 
@@ -158,7 +146,7 @@ def _depth_camera(frame: Frame) -> Camera:
     return (frame.depth_camera or cam.resize(frame.camera, frame.hw, hw)).to("cpu")
 
 
-def _focal_and_centre(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+def _intrinsics(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
     return (fx, fy), (cx, cy)
 
@@ -168,7 +156,8 @@ def _return_cloud(frame: Frame, mask: torch.Tensor) -> PointCloud:
     pixels = mask[0].cpu().nonzero()
     if not len(pixels):
         return EMPTY_CLOUD
-    v, u = _random_subset(pixels, MAX_CLOUD_POINTS).unbind(-1)
+    order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
+    v, u = pixels[order[:MAX_CLOUD_POINTS]].unbind(-1)
     camera = _depth_camera(frame)
     xyz = cam.unproject(camera, torch.stack((u, v), -1)[None].to(camera.f), frame.depth[:, v, u].cpu())
     rgb = _sample_colours(frame, cam.project(frame.camera.to("cpu"), xyz).nan_to_num())
@@ -195,17 +184,6 @@ def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
     return SweptPointCloud(points, rgb, sigmas, scores, sources, step_px=step, cause=causes)
 
 
-def _largest_cause(source: torch.Tensor, budget: SigmaBudget) -> torch.Tensor:
-    """Largest cause of sigma of samples, codes.Cause; of a return REFERENCE."""
-    cause = torch.where(source == Source.NONE, Cause.NONE, budget.dominating)
-    return torch.where(source == Source.SENSOR, Cause.REFERENCE, cause)
-
-
-def _random_subset(places: torch.Tensor, most: int) -> torch.Tensor:
-    """At most ``most`` rows of ``places``, drawn at random."""
-    return places[torch.randperm(len(places), generator=torch.Generator().manual_seed(0))[:most]]
-
-
 def _sample_colours(frame: Frame, uv: torch.Tensor) -> torch.Tensor:
     """Colours (1, N, 3) uint8 of the image at pixels, nearest neighbour."""
     image = torch.from_numpy(_image_uint8(frame)).permute(2, 0, 1)[None]
@@ -221,27 +199,14 @@ def _image_uint8(frame: Frame) -> np.ndarray:
 
 
 def _encode_jpeg(pixels: np.ndarray) -> tuple[bytes, tuple[int, int]]:
-    """(JPEG of an image, downscaled to at most :data:`_MAX_SIDE_PX`; its (height, width))."""
+    """(JPEG of an image, its longer side at most 800 px; its (height, width))."""
     from PIL import Image  # noqa: PLC0415  (comes with matplotlib)
 
-    image = Image.fromarray(pixels)
-    out = io.BytesIO()
-    image.thumbnail((_MAX_SIDE_PX, _MAX_SIDE_PX))
-    image.save(out, "JPEG", quality=_JPEG_QUALITY)
+    image, out = Image.fromarray(pixels), io.BytesIO()
+    image.thumbnail((800, 800))
+    image.save(out, "JPEG", quality=82)
     return out.getvalue(), (image.height, image.width)
-
-
-def _in_world(frame: Frame) -> np.ndarray:
-    return np.eye(4) if frame.T_world_from_cam is None else _pose_matrix(frame.T_world_from_cam)
 
 
 def _pose_matrix(pose: Pose) -> np.ndarray:
     return se3.to_matrix(pose)[0].detach().cpu().double().numpy()
-
-
-def _evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
-    """At most ``most`` items, evenly spaced, including the first and the last."""
-    n = len(items)
-    if n <= most:
-        return list(items)
-    return [items[k] for k in sorted({round(k * (n - 1) / max(most - 1, 1)) for k in range(most)})]

@@ -125,8 +125,7 @@ class Log:
 
 def test_a_recording_places_each_camera_and_every_point_where_it_stood(exhibit):
     log, (shot,) = Log(), exhibit.shots
-    rrd._log_points(log, log, shot)
-    rrd._log_swept(log, log, shot)
+    rrd._log_points(log, log, shot, True)
     rrd._log_views(log, log, shot, *exhibit.views)
     for k, name in ((1, "reference"), (2, "source")):
         placed, camera = log.of(f"world/{name}", "Transform3D"), log.of(f"world/{name}/picture", "Pinhole")
@@ -150,7 +149,7 @@ def test_a_recording_places_each_camera_and_every_point_where_it_stood(exhibit):
     assert log.of("world/map/swept", "Points3D").class_ids.tolist() == [rrd._SWEPT_CLASS, rrd._FILLED_CLASS]
     assert np.allclose(log.of("world/map/sensor", "Points3D").args[0], placed(shot.seen.xyz))
     alone = Log()
-    rrd._log_points(alone, alone, replace(shot, seen=EMPTY_CLOUD))
+    rrd._log_points(alone, alone, replace(shot, seen=EMPTY_CLOUD), False)
     sensed = alone.of("world/map/sensor", "Points3D")
     assert (
         np.allclose(sensed.args[0], placed(shot.samples["xyz"][:1]))

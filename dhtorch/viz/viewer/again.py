@@ -110,17 +110,14 @@ def _instantiate(node: Any, group: str, where: str) -> Any:
     }
     if "_target_" not in node:
         return options
-    function = _load_allowed_function(node["_target_"], group, where)
+    name = node["_target_"]
+    if name not in _ALLOWED_FUNCTIONS[group]:
+        expected = f"one of the functions for {group} in dhtorch/viz/viewer/again.py, none of which writes"
+        raise ValueError(f"result.config.{where}._target_: found {name!r}, expected {expected}")
+    module, _, last = name.rpartition(".")
+    function = getattr(importlib.import_module(module), last)
     try:
         inspect.signature(function).bind_partial(**options)  # unknown ones would fail later, with another message
         return partial(function, **options) if node.get("_partial_") else function(**options)
     except TypeError as error:
         raise ValueError(f"result.config.{where}: {error}") from error
-
-
-def _load_allowed_function(name: Any, group: str, where: str) -> Any:
-    if name not in _ALLOWED_FUNCTIONS[group]:
-        expected = f"one of the functions for {group} in dhtorch/viz/viewer/again.py, none of which writes"
-        raise ValueError(f"result.config.{where}._target_: found {name!r}, expected {expected}")
-    module, _, last = name.rpartition(".")
-    return getattr(importlib.import_module(module), last)

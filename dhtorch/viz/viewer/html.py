@@ -19,7 +19,7 @@ from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
 from dhtorch.viz.plots.colours import CAUSE_COLOURS, GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
 from dhtorch.viz.plots.markup import Markup, build_style_sheet, encode_png_uri, escape_html, make_tag
-from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud, SweptPointCloud
+from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud
 
 HTML_SUFFIXES = (".html", ".htm")
 
@@ -145,7 +145,15 @@ def _encode_pair(shot: PairExhibit) -> dict[str, Any]:
         "seen": _encode_cloud(shot.seen),
         "held_out": _encode_cloud(shot.held_out),
     }
-    encoded["swept"] = _encode_cloud(shot.swept) | _encode_confidence(shot.swept)
+    encoded["swept"] = _encode_cloud(shot.swept) | {
+        "sigma": _encode_array(shot.swept.sigma, "f4"),
+        "score": _encode_array(_quantise_scores(shot.swept.score), "u2"),
+        "source": _encode_array(shot.swept.source, "u1"),
+        "cause": _encode_array(
+            np.zeros(len(shot.swept.xyz), np.uint8) if shot.swept.cause is None else shot.swept.cause, "u1"
+        ),
+        "step_px": shot.swept.step_px,
+    }
     poses = {"T_world_from_0": shot.T_world_from_0, "T_world_from_1": shot.T_world_from_1}
     return encoded | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
 
@@ -166,16 +174,6 @@ def _encode_cloud(cloud: PointCloud) -> dict[str, Any]:
         "step": step.tolist(),
         "xyz": _encode_array(steps, "u2"),
         "rgb": _encode_array(cloud.rgb, "u1"),
-    }
-
-
-def _encode_confidence(cloud: SweptPointCloud) -> dict[str, Any]:
-    return {
-        "sigma": _encode_array(cloud.sigma, "f4"),
-        "score": _encode_array(_quantise_scores(cloud.score), "u2"),
-        "source": _encode_array(cloud.source, "u1"),
-        "cause": _encode_array(np.zeros(len(cloud.xyz), np.uint8) if cloud.cause is None else cloud.cause, "u1"),
-        "step_px": cloud.step_px,
     }
 
 

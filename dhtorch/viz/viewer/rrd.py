@@ -95,75 +95,68 @@ def _log_exhibit(rr: Any, stream: Any, scene: Exhibit) -> None:
     stream.log("about", rr.TextDocument(about), static=True)
     if scene.path is not None:
         stream.log("world/path", rr.LineStrips3D([scene.path], colors=parse_rgb(UNANSWERED)), static=True)
-    for name, (label, colour) in _describe_outcomes().items():
+    outcomes = {"SENSOR": ("sensor", parse_rgb(SENSOR)), "ANSWER": ("recovered", parse_rgb(RECOVERED))}
+    outcomes |= {names(Gate)[code]: (words(names(Gate)[code]), parse_rgb(c)) for code, c in GATE_COLOURS.items()}
+    for name, (label, colour) in outcomes.items():
         stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=label, colors=colour), static=True)
     swept = any(len(shot.swept.xyz) for shot in scene.shots)
     for k, shot in enumerate(scene.shots):
         stream.set_time("pair", sequence=k)
         if shot.view_0 is not None and (time := scene.views[shot.view_0].time) is not None:
             stream.set_time("time", duration=time)
-        _log_text(rr, stream, shot)
-        _log_points(rr, stream, shot)
-        if swept:
-            _log_swept(rr, stream, shot)
+        counts = shot.gates()
+        for name, count in counts.items():
+            stream.log(f"gates/{name.lower()}", rr.Scalars(count))
+        lines = [f"pair {shot.label}", *(f"{k}: {v}" for k, v in shot.facts.items()), ""]
+        lines += [f"{counts[name]:6d}  {label}" for name, (label, _) in outcomes.items() if counts[name]]
+        stream.log("pair", rr.TextDocument("\n".join(lines)))
+        _log_points(rr, stream, shot, swept)
         if shot.view_0 is not None and shot.view_1 is not None:
             _log_views(rr, stream, shot, scene.views[shot.view_0], scene.views[shot.view_1])
 
 
-def _describe_outcomes() -> dict[str, tuple[str, tuple[int, int, int]]]:
-    """Outcome → printed name and colour."""
-    outcomes = {"SENSOR": ("sensor", SENSOR), "ANSWER": ("recovered", RECOVERED)}
-    outcomes |= {names(Gate)[code]: (words(names(Gate)[code]), colour) for code, colour in GATE_COLOURS.items()}
-    return {name: (label, parse_rgb(colour)) for name, (label, colour) in outcomes.items()}
-
-
-def _log_text(rr: Any, stream: Any, shot: PairExhibit) -> None:
-    counts = shot.gates()
-    for name, count in counts.items():
-        stream.log(f"gates/{name.lower()}", rr.Scalars(count))
-    lines = [f"pair {shot.label}", *(f"{k}: {v}" for k, v in shot.facts.items()), ""]
-    lines += [f"{counts[name]:6d}  {label}" for name, (label, _) in _describe_outcomes().items() if counts[name]]
-    stream.log("pair", rr.TextDocument("\n".join(lines)))
-
-
-def _log_points(rr: Any, stream: Any, shot: PairExhibit) -> None:
+def _log_points(rr: Any, stream: Any, shot: PairExhibit, swept: bool) -> None:
     s, T = shot.samples, shot.T_world_from_0
     answer = s["source"] == Source.RECOVERED
     xyz, sigma = s["xyz"][answer], s["sigma"][answer]
+
+    def log(name: str, xyz: np.ndarray, *values: Any, **options: Any) -> None:
+        stream.log(f"world/map/{name}", rr.Points3D(_transform_points(T, xyz), **options), *values)
+
+    radii, classes = sigma.clip(_MIN_RADIUS_M, _MAX_RADIUS_M), np.full(len(xyz), Gate.ANSWER, np.uint16)
     values = {name: s[name][answer] for name in ("score", "sigma", "hole")}
-    radii = sigma.clip(_MIN_RADIUS_M, _MAX_RADIUS_M)
-    classes = np.full(len(xyz), Gate.ANSWER, np.uint16)
-    stream.log(
-        "world/map/recovered",
-        rr.Points3D(_transform_points(T, xyz), radii=radii, class_ids=classes),
-        rr.AnyValues(**values),
-    )
+    log("recovered", xyz, rr.AnyValues(**values), radii=radii, class_ids=classes)
     ratio = (sigma / np.maximum(s["depth"][answer], 1e-9)).clip(0, 0.9)[:, None]
     bars = np.stack((_transform_points(T, xyz * (1 - ratio)), _transform_points(T, xyz * (1 + ratio))), 1)
     stream.log("world/map/sigma", rr.LineStrips3D(bars, colors=[*parse_rgb(RECOVERED), 120]))
     sensed = s["source"] == Source.SENSOR
     seen = shot.seen if len(shot.seen.xyz) else PointCloud(s["xyz"][sensed], s["rgb"][sensed])
     for name, cloud in (("sensor", seen), ("held_out", shot.held_out)):
-        stream.log(
-            f"world/map/{name}", rr.Points3D(_transform_points(T, cloud.xyz), colors=cloud.rgb, radii=_MIN_RADIUS_M)
-        )
-
-
-def _log_swept(rr: Any, stream: Any, shot: PairExhibit) -> None:
-    cloud = shot.swept
-    classes = np.where(cloud.source == Source.FILLED, _FILLED_CLASS, _SWEPT_CLASS).astype(np.uint16)
-    dots = rr.Points3D(_transform_points(shot.T_world_from_0, cloud.xyz), radii=_MIN_RADIUS_M, class_ids=classes)
-    stream.log("world/map/swept", dots, rr.AnyValues(score=cloud.score, sigma=cloud.sigma))
+        log(name, cloud.xyz, colors=cloud.rgb, radii=_MIN_RADIUS_M)
+    if swept:
+        classes = np.where(shot.swept.source == Source.FILLED, _FILLED_CLASS, _SWEPT_CLASS).astype(np.uint16)
+        values = {name: getattr(shot.swept, name) for name in ("score", "sigma")}
+        log("swept", shot.swept.xyz, rr.AnyValues(**values), radii=_MIN_RADIUS_M, class_ids=classes)
 
 
 def _log_views(rr: Any, stream: Any, shot: PairExhibit, view_0: ExhibitView, view_1: ExhibitView) -> None:
     s = shot.samples
-    _log_camera(rr, stream, "reference", shot.T_world_from_0, view_0)
     if shot.depth_image is not None:
         (h, w), m = shot.depth_image.depth.shape, shot.depth_image
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
         stream.log("world/reference/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
         stream.log("world/reference/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH_CMAP))
+    for name, T, view in (("reference", shot.T_world_from_0, view_0), ("source", shot.T_world_from_1, view_1)):
+        if T is None:
+            stream.log(f"world/{name}", rr.Clear(recursive=True))
+            continue
+        h, w = view.jpeg_hw
+        scale = (w / view.hw[1], h / view.hw[0])
+        c, f = [(view.c[k] + 0.5) * scale[k] for k in range(2)], [view.f[k] * scale[k] for k in range(2)]
+        stream.log(f"world/{name}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        camera = rr.Pinhole(focal_length=f, principal_point=c, width=w, height=h, image_plane_distance=0.3)
+        stream.log(f"world/{name}/picture", camera)
+        stream.log(f"world/{name}/picture", rr.EncodedImage(contents=view.jpeg, media_type="image/jpeg"))
     groups = {"unanswered": Source.NONE, "sensor": Source.SENSOR, "recovered": Source.RECOVERED}
     classes = np.where(s["source"] == Source.SENSOR, _SENSOR_CLASS, s["gate"]).astype(np.uint16)
     at_0, at_1 = _to_jpeg_pixels(view_0, s["uv_0"]), _to_jpeg_pixels(view_1, s["uv_1"])
@@ -171,25 +164,10 @@ def _log_views(rr: Any, stream: Any, shot: PairExhibit, view_0: ExhibitView, vie
         of_source = s["source"] == code
         points = rr.Points2D(at_0[of_source], class_ids=classes[of_source], radii=1.5 if code == Source.NONE else 2.5)
         stream.log(f"world/reference/picture/samples/{name}", points)
-    if shot.T_world_from_1 is not None:
-        _log_camera(rr, stream, "source", shot.T_world_from_1, view_1)
-    else:
-        stream.log("world/source", rr.Clear(recursive=True))
     tracked = s["tracked"]
     strips = np.stack((_to_jpeg_pixels(view_1, s["uv_0"])[tracked], at_1[tracked]), 1)
     stream.log("world/source/picture/tracks", rr.LineStrips2D(strips, class_ids=classes[tracked]))
     stream.log("world/source/picture/samples", rr.Points2D(at_1[tracked], class_ids=classes[tracked], radii=2.0))
-
-
-def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: ExhibitView) -> None:
-    h, w = view.jpeg_hw
-    s = (w / view.hw[1], h / view.hw[0])
-    c = [(view.c[k] + 0.5) * s[k] for k in range(2)]
-    f = [view.f[k] * s[k] for k in range(2)]
-    stream.log(f"world/{name}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-    camera = rr.Pinhole(focal_length=f, principal_point=c, width=w, height=h, image_plane_distance=0.3)
-    stream.log(f"world/{name}/picture", camera)
-    stream.log(f"world/{name}/picture", rr.EncodedImage(contents=view.jpeg, media_type="image/jpeg"))
 
 
 def _to_jpeg_pixels(view: ExhibitView, uv: np.ndarray) -> np.ndarray:
