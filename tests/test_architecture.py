@@ -20,7 +20,7 @@ FLOORS = (
     {"cli"},
     {"extract", "experiments"},
     {"transforms", "measure"},
-    {"validation", "integrate", "synthetic"},
+    {"validation", "integrate", "synthetic", "losses"},
     {"pipeline", "functional"},
     {"stages", "alignment", "metrics", "export", "data"},
     {"viz"},
