@@ -8,6 +8,7 @@ import pickle
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
 from support.ca1m_archives import ca1m_archive, ca1m_frames
+from support.capture_cases import Case, check_case
 
 from dhtorch import data
 from dhtorch.data import FormatError
@@ -24,7 +26,7 @@ from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.readers import ca1m
 from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.geometry import se3
-from dhtorch.records import Camera
+from dhtorch.records import Camera, Frame
 
 PORTRAIT = Camera(torch.tensor([[58.25, 61.5]]), torch.tensor([[21.75, 30.5]]))
 
@@ -57,17 +59,6 @@ def test_gives_back_the_scene(tmp_path: Path) -> None:
     assert len(data.open_all(tmp_path)) == 1
 
 
-def test_portrait_pictures_keep_their_orientation(tmp_path: Path) -> None:
-    T = shots([100.0])[0].T_world_from_cam
-    size = (64, 48)
-    frame, laser = (render(PORTRAIT, T, size, 100.0) for _ in range(2))
-    writers.write_ca1m(tmp_path / "ca1m-train-1.tar", [frame], [laser])
-    recording = data.open(tmp_path)
-    assert recording[0].hw == size and recording.report == ("no confidence: all returns are weighted equally",)
-    check_same(recording, [frame], 1 / 1000)
-    assert recording.truth(0)["depth"].shape == (1, *size)
-
-
 def test_laser_depth_is_the_truth_at_the_images_pixels(tmp_path: Path) -> None:
     file, frames, _ = ca1m_archive(tmp_path, n=2)
     recording = data.open(file)
@@ -93,77 +84,102 @@ def test_failed_registration_is_rejected(tmp_path: Path) -> None:
     assert data.open(tmp_path, max_disagreement=0.2).truth(1)["depth"].any()
 
 
-def test_a_member_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -> None:
-    missing = [(1, "gt/RT.json"), (3, "wide/depth/confidence.tiff"), (4, "wide/image.png"), (5, "gt/depth/K.json")]
-    file, frames, _ = ca1m_archive(tmp_path, n=6, without=missing)
+def write(
+    root: Path,
+    frames: list[Frame],
+    *,
+    lasers: list[Frame] | None = None,
+    change: Callable[[str, bytes], tuple[str, bytes] | None] | None = None,
+    **options: Any,
+) -> None:
+    """An archive with its members changed."""
+    file = root / "ca1m-val-1.tar"
+    writers.write_ca1m(file, frames, ca1m_frames(len(frames))[1] if lasers is None else lasers, **options)
+    if change is not None:
+        rewrite(file, change)
+
+
+def ca1m_case(name: str, n: int = 4, expect: Any = None, **more: Any) -> Case:
+    frames = more.pop("frames", lambda: ca1m_frames(n)[0])
+    rest = {key: more.pop(key) for key in ("options", "error") if key in more}
+    return Case(name, write, frames, (), expect or {}, written=more, path="ca1m-val-1.tar", **rest)
+
+
+def plain(name: str, body: bytes) -> tuple[str, bytes] | None:
+    """No confidence and no intrinsics of the depth."""
+    return None if "confidence" in name or "wide/depth/K" in name else (name, body)
+
+
+def flat(name: str, body: bytes) -> tuple[str, bytes]:
+    """Flat matrices, and other extensions."""
+    if "RT" in name or "K.json" in name:
+        return f"./{name}", b"[" + body.replace(b"[", b"").replace(b"]", b"") + b"]"
+    return name.replace(".png", ".tiff").replace("wide/depth.", "WIDE/Depth."), body
+
+
+def confidence(values: np.ndarray) -> Callable[[str, bytes], tuple[str, bytes]]:
+    """Another confidence in every frame."""
+    return lambda name, body: (name, encode_float_tiff(values) if "confidence" in name else body)
+
+
+def upright() -> list[Frame]:
+    """A frame of a phone that was held upright."""
+    return [render(PORTRAIT, shots([100.0])[0].T_world_from_cam, (64, 48), 100.0)]
+
+
+NONE = ("no confidence: all returns are weighted equally",)
+LEVELS = ca1m_frames(1)[0][0].conf[0].numpy()
+MISSING = [(1, "gt/RT.json"), (3, "wide/depth/confidence.tiff"), (4, "wide/image.png"), (5, "gt/depth/K.json")]
+LOST = [f"^1 frame without {what}: left out" for what in ("gt/rt", "wide/depth/confidence", "wide/image")]
+TIMES = [99.9, 100.0, 100.1]
+
+CASES = [
+    ca1m_case("held upright", 1, {"hw": (64, 48), "report": NONE, "same": ([0], 1e-3), "truth": True}, frames=upright,
+              lasers=upright()),
+    ca1m_case("members missing in the middle", 6, {"number": [0, 2, 5], "same": ([0, 2, 5], 1e-3), "truth": True},
+              without=MISSING),
+    ca1m_case("members missing, no confidence wanted", 6, {"number": [0, 2, 3, 5]}, without=MISSING,
+              options={"confidence": None}),
+    ca1m_case("no confidence, no camera of the depth", 4,
+              {"conf": False, "depth f": None, "number": [0, 1, 2, 3], "report": NONE}, change=plain),
+    ca1m_case("no truth wanted", 2, {"truth": False}, options={"truth": False}),
+    ca1m_case("levels", 1, {"same": ([0], 1e-3), "conf": True}, change=confidence(LEVELS),
+              options={"confidence": "level"}),
+    ca1m_case("levels taken for fractions", 1, change=confidence(LEVELS),
+              error=r"confidence: found 0 to 2, expected 0 to 1 \(option confidence"),
+    ca1m_case("no numbers", 1, change=confidence(np.where(LEVELS > 1, np.nan, 0.0)),
+              error="confidence: found 0 to 0, expected 0 to 1"),
+    ca1m_case("an unknown option", 1, options={"confidence": "percent"},
+              error="option confidence: found percent, expected unit, level or None"),
+    ca1m_case("flat matrices and other extensions", 4, {"same": ([0, 1, 2, 3], 1e-3)}, change=flat),
+    ca1m_case("frames sorted as numbers", 3, {"times": TIMES, "same": ([2, 1, 0], 1e-3)},
+              frames=lambda: shots(TIMES)[::-1], lasers=shots(TIMES)[::-1]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
+
+
+def test_what_is_lost_is_named_and_strange_members_are_passed_over(tmp_path: Path) -> None:
+    file, frames, _ = ca1m_archive(tmp_path, n=6, without=MISSING)
     recording = data.open(file)
-    assert recording.number.tolist() == [0, 2, 5]
-    assert set(recording.report) == {
-        "1 frame without gt/rt: left out",
-        "1 frame without wide/depth/confidence: left out",
-        "1 frame without wide/image: left out",
-    }
-    check_same(recording, [frames[i] for i in (0, 2, 5)], 1 / 1000)
+    assert sorted(recording.report) == sorted(line.removeprefix("^") for line in LOST)
     assert recording.truth(2)["depth"].any()  # the laser's camera taken for that of the image, scaled
-    assert data.open(file, confidence=None).number.tolist() == [0, 2, 3, 5]
-
-
-def test_without_any_confidence_or_depth_intrinsics(tmp_path: Path) -> None:
-    file, _, _ = ca1m_archive(tmp_path)
-    rewrite(file, lambda name, body: None if "confidence" in name or "wide/depth/K" in name else (name, body))
-    recording = data.open(file)
-    assert recording.report == ("no confidence: all returns are weighted equally",) and len(recording) == 4
-    assert recording[0].conf is None and recording[0].depth_camera is None
-
-
-def test_confidence_is_a_share_or_a_level(tmp_path: Path) -> None:
-    file, frames, _ = ca1m_archive(tmp_path, n=1)
-    steps = torch.linspace(0, 1, HW[0] * HW[1]).view(HW)
-
-    def stored(picture: np.ndarray) -> None:
-        rewrite(file, lambda name, body: (name, encode_float_tiff(picture) if "confidence" in name else body))
-
-    stored(steps.numpy())
-    conf = data.open(file)[0].conf[0]
-    assert conf[steps < 0.25].max() == 0 and conf[steps >= 0.75].min() == 2
-    assert set(conf[(steps >= 0.25) & (steps < 0.75)].tolist()) == {1}
-    levels = frames[0].conf[0].numpy()
-    stored(levels)
-    assert torch.equal(data.open(file, confidence="level")[0].conf, frames[0].conf)
-    with pytest.raises(FormatError, match=r"confidence: found 0 to 2, expected 0 to 1 \(option confidence"):
-        data.open(file)[0]
-    stored(np.where(levels > 1, np.nan, 0.0))
-    with pytest.raises(FormatError, match="confidence: found 0 to 0, expected 0 to 1"):
-        data.open(file)[0]
-    with pytest.raises(FormatError, match="option confidence: found percent, expected unit, level or None"):
-        data.open(file, confidence="percent")
-
-
-def test_flat_matrices_other_extensions_and_strange_members(tmp_path: Path) -> None:
-    file, frames, _ = ca1m_archive(tmp_path)
-
-    def change(name: str, body: bytes) -> tuple[str, bytes]:
-        if "RT" in name or "K.json" in name:
-            body = body.replace(b"[", b"").replace(b"]", b"")
-            return f"./{name}", b"[" + body + b"]"
-        return (name.replace(".png", ".tiff").replace("wide/depth.", "WIDE/Depth."), body)
-
-    rewrite(file, change)
     with tarfile.open(file, "a") as more:
         for name in ("../../outside.wide/image.png", "/1/2.wide/image.png", "readme.txt", "42898570/x.wide/image.png"):
-            info = tarfile.TarInfo(name)
-            more.addfile(info)
-    check_same(data.open(file), frames, 1 / 1000)
+            more.addfile(tarfile.TarInfo(name))
+    check_same(data.open(file), [frames[i] for i in (0, 2, 5)], 1 / 1000)
     assert sorted(p.name for p in tmp_path.iterdir()) == [file.name]
 
 
-def test_frames_are_sorted_as_numbers(tmp_path: Path) -> None:
-    times = [99.9, 100.0, 100.1]
-    frames = shots(times)
-    writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames[::-1], frames[::-1])
-    recording = data.open(tmp_path)
-    assert recording.times.tolist() == times
-    check_same(recording, frames, 1 / 1000)
+def test_confidence_is_a_fraction_in_three_steps(tmp_path: Path) -> None:
+    steps = torch.linspace(0, 1, HW[0] * HW[1]).view(HW)
+    write(tmp_path, ca1m_frames(1)[0], change=confidence(steps.numpy()))
+    conf = data.open(tmp_path)[0].conf[0]
+    assert conf[steps < 0.25].max() == 0 and conf[steps >= 0.75].min() == 2
+    assert set(conf[(steps >= 0.25) & (steps < 0.75)].tolist()) == {1}
 
 
 def test_poses_are_camera_to_world(tmp_path: Path) -> None:

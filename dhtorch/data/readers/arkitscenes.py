@@ -328,8 +328,7 @@ def _count_lost_pictures(times: np.ndarray, depth: _AssetMatch) -> int:
     unmatched = np.delete(depth.stamped.times, depth.at[depth.at >= 0])
     gaps, after = np.diff(times), np.searchsorted(times, unmatched)
     inside = (after > 0) & (after < len(times))
-    # Gap between two pictures, in their median step, above which a picture is missing. Source: derived, half a step
-    # more.
+    # A gap of one and a half median steps: a picture is missing.
     return int((gaps[after[inside] - 1] > 1.5 * np.median(gaps)).sum())
 
 
@@ -369,7 +368,7 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
     R = convert.to_c2w(q, rows[:, 4:], file, "rotation")[:, :3, :3]  # world to camera
     centre = -np.einsum("nji,nj->ni", R, rows[:, 4:])
     inverse = q * [-1, -1, -1, 1]
-    # Largest difference in s of a pose and an image with the same stamp rounded to milliseconds.
+    # Stamps that are rounded to milliseconds differ by up to half of one.
     limits = {"same": 0.00051, "max_difference": max_difference, "max_gap": max_gap}
     q_at, t_at, covered = interpolate_poses(times, rows[:, 0], inverse, centre, **limits)
     return convert.to_c2w(q_at, t_at, file, "rotation"), covered
@@ -378,7 +377,7 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
 def _count_quarter_turns(c2w: np.ndarray, report: list[str]) -> int:
     """Number of clockwise quarter turns that put the sky on top, from the mean gravity over the frames."""
     x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up direction in camera axes
-    # Length of the mean gravity direction's projection onto the image plane below which the image is not rotated.
+    # The mean gravity direction's projection onto the image plane is too short to show a side.
     if max(abs(x), abs(y)) < 0.1:
         report.append("the camera looks straight up or down: images are not rotated")
         return 0

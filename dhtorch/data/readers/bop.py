@@ -103,7 +103,7 @@ def _read_sensor(
     scales = [files.to_positive(entries[row.number].get("depth_scale"), table, "depth_scale") for row in rows]
     stated = [files.to_array(entries[row.number].get("cam_K"), (9,), table, "cam_K").reshape(3, 3) for row in rows]
     cameras: dict[bytes, Camera] = {}  # equal matrices share one camera
-    if options == (None, None, None):
+    if all(option is None for option in options):
         hw = files.read_image_header(rows[0].image).hw
         cameras = {K.tobytes(): convert.to_camera(K, hw, table, "cam_K") for K in stated}
     if len(set(scales)) > 1:

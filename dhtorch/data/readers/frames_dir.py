@@ -293,7 +293,7 @@ def _compare_with_file(root: Path, *used: tuple[object, Path, str] | None) -> li
         return []
     stated = read_K(file)
     matrices = [files.to_array(source[0], (3, 3), *source[1:]) for source in used if source is not None]
-    # Largest relative difference of two matrices that state one camera. Source: chosen: rounding to three digits.
+    # Two matrices that state one camera may differ by rounding to three digits.
     if any(np.allclose(K, stated, rtol=1e-3) for K in matrices):
         return []
     return [

@@ -115,10 +115,8 @@ def choose_rotated_bits(file: Path, rotated: bool | None, whose: str) -> tuple[i
     if rotated is None:
         code = files.read_depth_png(file, 1).astype(np.uint16)
         returns = code[code > 0]
-        # Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most this number for
-        # depths below 3/8 of the range (24.6 m in mm); plain codes have all 8 numbers there. Source: derived.
-        # Least share of non-zero codes with such lower bits in rotated codes; 3/8 of plain codes have them. Source:
-        # chosen between 3/8 and 1.
+        # Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most 2 for depths below
+        # 3/8 of the range (24.6 m in mm); 3/8 of plain codes have such lower bits, so that 0.7 divides 3/8 from 1.
         rotated = returns.size == 0 or float((returns % 8 <= 2).mean()) >= 0.7
     if rotated:
         return 3, ()
@@ -380,8 +378,8 @@ def fit_K(
     if stated_hw == hw:
         return K, ()
     sizes = f"{hw[1]}x{hw[0]}", f"{stated_hw[1]}x{stated_hw[0]}"
-    # Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of
-    # the shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
+    # Aspect ratios of one image at two sizes: rounding of the shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's
+    # 1296×968 differs from 640×480 by 0.4 %.
     if abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01:
         raise FormatError(file, "image size", sizes[1], f"{sizes[0]} as the images, or the same aspect ratio (data.K)")
     report = f"images of {sizes[0]}, {file.name} states K for {sizes[1]}: K is scaled"

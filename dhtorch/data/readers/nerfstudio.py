@@ -238,8 +238,7 @@ def _parse_applied(meta: Mapping[str, Any], file: Path) -> tuple[np.ndarray, lis
     if meta.get("applied_transform") is not None:
         applied = parse_matrix(meta["applied_transform"], file, "applied_transform")
         R = applied[:3, :3]
-        # Largest error of the rotation in ``applied_transform`` that is rounding. Source: chosen on: six printed
-        # digits.
+        # Six printed digits leave an error of rounding.
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
             raise FormatError(file, "applied_transform", R.tolist(), "a rotation and a translation")
     scale = files.to_positive(meta.get("applied_scale", 1.0), file, "applied_scale")

@@ -132,8 +132,7 @@ def _find_intrinsics(root: Path) -> Path | None:
     """The first JSON file of the folder with an intrinsic matrix; None where there is none."""
     for file in sorted(root.glob("*.json")):
         with contextlib.suppress(FormatError):
-            # Largest number of bytes of a file that is searched for an intrinsic matrix at recognition; the files
-            # hold under 1 kB. Source: chosen.
+            # Files with an intrinsic matrix hold under 1 kB; large ones are not searched at recognition.
             if file.is_file() and file.stat().st_size <= 100_000 and _MATRIX_FIELD in files.read_json(file):
                 return file
     return None

@@ -147,8 +147,8 @@ def sort_posed_images(rows: Sequence[PosedImage]) -> list[PosedImage]:
     counted = []
     for row in rows:
         match = re.search(r"(\d+)\D*$", row.image.stem)  # the last number in the name, if it can count frames
-        # Most digits of a number in a file's name that counts frames; longer numbers are time stamps. Source: chosen
-        # on: a week at 100 Hz has 8 digits, time stamps in µs since a phone's start have 10 or more.
+        # A number of more digits is a time stamp: a week at 100 Hz has 8 digits, time stamps in µs since a phone's
+        # start have 10 or more.
         number = int(match[1]) if match and len(match[1]) <= 9 else -1
         counted.append(row if row.number >= 0 else replace(row, number=number))
     numbers = [row.number for row in counted]
@@ -258,8 +258,8 @@ def _parse_times(rows: Sequence[PosedImage]) -> tuple[Tensor | None, list[str]]:
     steps = times.diff()
     if not bool(times.isfinite().all()) or not bool((steps > 0).all()):
         return None, ["time stamps do not increase with the numbers of the images: there are no times"]
-    # Largest median time between two images in s; beyond it the stamps are no seconds. Source: chosen on: nanoseconds
-    # and microseconds of video give 1e4 or more, images of a person walking from place to place far less.
+    # Stamps of larger steps are no seconds: nanoseconds and microseconds of video give 1e4 or more, images of a person
+    # walking from place to place far less.
     if len(steps) and float(steps.median()) > 1000.0:
         return None, [f"time stamps step by {float(steps.median()):.6g}, no seconds: there are no times"]
     return times, []
