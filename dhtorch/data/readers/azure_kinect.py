@@ -54,16 +54,13 @@ class _Tracks(NamedTuple):
     depth: int
 
 
-def find_depth_track(file: Path) -> video.VideoTrack | None:
-    """The depth track of a Matroska video; None where there is none or the file is no such video."""
-    tracks = _find_tracks(file)
-    return None if tracks is None else video.list_video_tracks(file)[tracks.depth]
-
-
 def recognise(root: Path) -> str | None:
     """The content by which ``root`` is recognised as this format, as text; None if it is not."""
-    track = find_depth_track(root)
-    return None if track is None else f"a video with a depth track {track.name or track.codec}"
+    tracks = _find_tracks(root)
+    if tracks is None:
+        return None
+    track = video.list_video_tracks(root)[tracks.depth]
+    return f"a video with a depth track {track.name or track.codec}"
 
 
 def read(

@@ -64,7 +64,7 @@ def _load_frame(
         levels = level_of_code(files.read_image(row.conf, depth_hw)[0])
         conf = torch.from_numpy(np.ascontiguousarray(levels, np.uint8))[None]
     image = torch.from_numpy(files.read_image(row.image, hw, exif))
-    depth = np.zeros(depth_hw) if row.depth is None else read_depth_steps(row.depth, depth_hw) * step_m
+    depth = np.zeros(depth_hw) if row.depth is None else _read_depth_steps(row.depth, depth_hw) * step_m
     if row.depth is not None and row.origin is not None:
         depth[files.read_image(row.origin, depth_hw)[0] != Source.SENSOR] = 0
     return Frame(image[None], torch.from_numpy(depth.astype(np.float32))[None], camera, conf=conf)
@@ -96,7 +96,7 @@ def open_posed_images(
     Raises:
         FormatError: no image, images of several aspect ratios, or values that are no cameras or poses.
     """
-    lines, rows = list(report), sort_posed_images(rows)
+    lines, rows = list(report), _sort(rows)
     rows, left_out = _select_complete(rows)
     lines += left_out
     if not rows:
@@ -142,7 +142,7 @@ def open_posed_images(
     )
 
 
-def sort_posed_images(rows: Sequence[PosedImage]) -> list[PosedImage]:
+def _sort(rows: Sequence[PosedImage]) -> list[PosedImage]:
     """Rows in the order of their numbers, else of the numbers in their names, else of time, else of their names."""
     counted = []
     for row in rows:
@@ -161,7 +161,7 @@ def sort_posed_images(rows: Sequence[PosedImage]) -> list[PosedImage]:
     return sorted(unnumbered, key=lambda row: files.natural_sort_key(row.image))
 
 
-def read_depth_steps(file: Path, hw: tuple[int, int]) -> np.ndarray:
+def _read_depth_steps(file: Path, hw: tuple[int, int]) -> np.ndarray:
     """Depth (h, w) float64 in steps of the file's unit; 0 = no return, also for codes and values that mean none.
 
     Raises:
