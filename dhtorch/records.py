@@ -43,7 +43,6 @@ __all__ = [
 
 #: Least trackability (smaller eigenvalue of the mean gradient matrix, grey values in [0, 1]) of a sample that is used:
 #: the default of every ``min_trackability``.
-#: Source: origin not recorded.
 MIN_TRACKABILITY = 1e-5
 
 

@@ -53,15 +53,6 @@ _MODELS_OF_KIND: Final = {
     "ordinal": tuple(MODEL_HEADS),
 }
 
-#: Kinds whose values are linear in depth. Source: derived, the definitions above.
-_KINDS_OF_DEPTH: Final = ("metric", "scale", "affine")
-
-#: Cross-validation folds of scattered blocks: 2 × 2 checkerboard classes. Source: derived, 2 · 2.
-N_SCATTERED_FOLDS = 4
-
-#: Cross-validation folds of whole quarters of the picture. Source: derived, 2 · 2.
-N_QUADRANT_FOLDS = 4
-
 
 class ModelSelection(NamedTuple):
     """Probabilities of the models and the factor on sigma; for reports."""
@@ -151,7 +142,7 @@ def align_depth(
         x, points = x / unit[..., None], points._replace(x=points.x / unit, within=points.within / unit)
     problem = _alignment_problem(x, valid, points, options, of_depth=kind != "inverse")
     fits, selection = _select_model(problem, _MODELS_OF_KIND[kind])
-    if kind in _KINDS_OF_DEPTH:
+    if kind in ("metric", "scale", "affine"):  # values are linear in depth
         family = find_map_family(points, options)
         selection = selection._replace(model=torch.where(family == 0, selection.model, -1), family=family)
     if trace is not None:
@@ -210,7 +201,12 @@ def _select_model(problem: AlignmentProblem, names: tuple[str, ...]) -> tuple[Er
         head_of_model = torch.tensor([heads.index(ERROR_MODELS[name].head) for name in names], device=index.device)
         head = head_of_model[candidates[:, -1]]
         selected = _one_standard_error_choice(points, held_out, heads, head, options)[:, None]
-        factor = _sigma_scale(points, held_out, selected, options)
+        # Factor (B,) on sigma under which 68 % of the left-out near references lie within one sigma.
+        r, var = (part.gather(1, selected[..., None, None].expand(-1, 1, *part.shape[2:]))[:, 0] for part in held_out)
+        ratio = torch.where(points.near[:, None], r.abs() / var.sqrt(), torch.nan).flatten(1)
+        n = ratio.isfinite().sum(-1)
+        factor = ratio.nanquantile(0.683, -1).nan_to_num(1.0).clamp_min(1e-3)
+        factor = (factor.log() * n / (n + options.sigma_scale_prior)).exp().clamp(*options.sigma_scale_range)
         best = candidates.gather(1, selected)
         # Left-out references do not distinguish the selected model from the most probable one: equal weights.
         share = weight.scatter(1, best, weight.amax(-1, keepdim=True))
@@ -228,9 +224,8 @@ def _cross_validate(problem: AlignmentProblem, model: Tensor) -> _HeldOut:
     cell = points.block // 2
     row, column = cell // ERROR_BLOCKS[1], cell % ERROR_BLOCKS[1]
     quarter = 2 * (2 * row // ERROR_BLOCKS[0]) + 2 * column // ERROR_BLOCKS[1]
-    folds = [(row * 2 + column) % N_SCATTERED_FOLDS == k for k in range(N_SCATTERED_FOLDS)] + [
-        quarter == k for k in range(N_QUADRANT_FOLDS)
-    ]
+    # Folds of scattered blocks (2 × 2 checkerboard classes), and of whole quarters of the picture.
+    folds = [(row * 2 + column) % 4 == k for k in range(4)] + [quarter == k for k in range(4)]
     in_fold = torch.stack(folds, 1)
     left_out = in_fold.repeat(1, model.shape[1], 1)
     fit = error_model.fit_models(problem, model.repeat_interleave(len(folds), 1), points.used[:, None] & ~left_out)
@@ -317,15 +312,6 @@ def _block_losses(points: MetricReferences, held_out: _HeldOut, options: Alignme
     return _BlockLosses(mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9), near_error.nan_to_num(torch.inf))
 
 
-def _sigma_scale(points: MetricReferences, held_out: _HeldOut, selected: Tensor, options: AlignmentOptions) -> Tensor:
-    """Factor (B,) on sigma under which 68 % of the left-out near references lie within one sigma."""
-    r, var = (part.gather(1, selected[..., None, None].expand(-1, 1, *part.shape[2:]))[:, 0] for part in held_out)
-    ratio = torch.where(points.near[:, None], r.abs() / var.sqrt(), torch.nan).flatten(1)
-    n = ratio.isfinite().sum(-1)
-    factor = ratio.nanquantile(0.683, -1).nan_to_num(1.0).clamp_min(1e-3)
-    return (factor.log() * n / (n + options.sigma_scale_prior)).exp().clamp(*options.sigma_scale_range)
-
-
 # ---------------------------------------------------------------------------------------------------------- every pixel
 
 
@@ -334,7 +320,9 @@ def _average_models(
 ) -> tuple[Tensor, Tensor]:
     """Log depth (B, h, w) of the selected model, and its standard deviation with that of the model averaging."""
     share = torch.softmax(fits.evidence.nan_to_num(neginf=-1e300).detach(), -1)
-    logs, var = zip(*(_predict_map(problem, fits.pick(index), x) for index in _model_indices(fits)), strict=True)
+    B, M = fits.model.shape
+    picks = (fits.pick(fits.model.new_full((B, 1), k)) for k in range(M))
+    logs, var = zip(*(_predict_map(problem, fit, x) for fit in picks), strict=True)
     means = torch.stack(logs, 1)
     log_depth = means[:, 0]
     with torch.no_grad():
@@ -408,12 +396,6 @@ def _far_log_odds(points: MetricReferences, r: Tensor, r_other: Tensor, options:
 def _log_line(x: Tensor) -> Tensor:
     """Columns (..., 2) of a line in log x: one and the logarithm; 0 where there is none."""
     return torch.stack((torch.ones_like(x), torch.where(x > 0, x, 1.0).log()), -1)
-
-
-def _model_indices(fits: ErrorModelFit) -> list[Tensor]:
-    """Indices (B, 1) of every model in turn."""
-    B, M = fits.model.shape
-    return [fits.model.new_full((B, 1), k) for k in range(M)]
 
 
 def _predict_map(problem: AlignmentProblem, fit: ErrorModelFit, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -377,7 +377,9 @@ def _problem(task: AlignmentProblem, model: Tensor, used: Tensor) -> _Problem:
     free = points.x.new_tensor([MODEL_HEADS[m.head] for m in models])[model]
     short = torch.tensor([m.short for m in models], device=model.device)[model]
     rest = torch.cat((evaluate_curves(basis, points.x), motion_error_basis(points)), -1)[:, None].expand(B, K, -1, -1)
-    sd = points.x.new_tensor([_prior_sigmas(m) for m in models])[model.flatten()]
+    nodes = FIELD_NODES[0] * FIELD_NODES[1]
+    sigmas = [[m.tilt] * N_TILT_SLOPES + [m.field] * nodes + [m.curve] * N_CURVE_KNOTS for m in models]
+    sd = points.x.new_tensor([s + [1.0] * N_MOTION_ERRORS for s in sigmas])[model.flatten()]
     start = task.start.gather(1, head[..., None].expand(-1, -1, 2))
     head_sd = free * torch.stack(
         (options.scale_prior_sigma * start[..., 0], (options.shift_prior_sigma * task.level).expand_as(head)), -1
@@ -399,12 +401,6 @@ def _problem(task: AlignmentProblem, model: Tensor, used: Tensor) -> _Problem:
         freedom=torch.full_like(per_fit(points.x), options.student_freedom),
         basis=basis,
     )
-
-
-def _prior_sigmas(model: ErrorModel) -> list[float]:
-    """Prior standard deviations of slopes, field nodes, curve knots and motion errors."""
-    field = [model.field] * (FIELD_NODES[0] * FIELD_NODES[1])
-    return [model.tilt] * N_TILT_SLOPES + field + [model.curve] * N_CURVE_KNOTS + [1.0] * N_MOTION_ERRORS
 
 
 def motion_error_basis(points: MetricReferences) -> Tensor:

@@ -8,146 +8,123 @@ from typing import Final
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """Options of :func:`dhtorch.alignment.align.align_depth`: its tuning constants with their meaning, unit and
-    origin."""
+    """Options of :func:`dhtorch.alignment.align.align_depth`: its tuning constants with their meaning and unit.
+
+    Chosen on ``data=shared_scenes``, those of model selection also on ``data=streams`` (``align_study.json``,
+    ``align_study_streams.json``).
+    """
 
     # References
 
     #: Most references of one source, evenly spread over its samples or pixels.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     max_references_per_source: int = 512
 
     #: Relative error of every return in addition to its stated one.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     min_return_error: float = 0.01
 
     #: Relative error of a far answer alone in addition to its stated one: wrong matches.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     far_own_error: float = 0.02
 
     #: Relative error that all far answers share in addition to their stated one: motions with too small a covariance.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     far_shared_error: float = 0.05
 
     #: Fraction of the variance of a map's far pixels that all share (their motion's).
-    #: Source: chosen on data=shared_scenes, align_study.json.
     map_shared_ratio: float = 0.5
 
     #: Correlation of the errors of two references of one block.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     block_correlation: float = 0.3
 
     # Error models and their fits
 
     #: Correlation lengths of fields, long and short, as a fraction of the picture's longer side.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     field_lengths: tuple[float, float] = (0.3, 0.13)
 
     #: Correlation length of the correction, as a fraction of the range of log values.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     curve_length: float = 0.4
 
     #: Degrees of freedom of Student's t during selection: tails heavy enough to keep a fit of which nearly half of the
     #: references are outliers.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     student_freedom: float = 1.0
 
     #: Degrees of freedom with lighter tails, candidates for near returns without such outliers.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     lighter_freedoms: tuple[float, ...] = (2.0, 4.0, 8.0, 30.0)
 
     #: Least noise of a reference, of log depth.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     min_reference_noise: float = 3e-4
 
     #: Bounds of the factor on the stated noise of near returns.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     near_noise_range: tuple[float, float] = (1e-4, 1e4)
 
     #: Bounds of the factor on the stated noise of far answers.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     far_noise_range: tuple[float, float] = (0.4, 8.0)
 
     #: Prior weight of a factor of 1 on the stated noise, in references.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     stated_noise_weight: float = 0.1
 
     #: Prior standard deviation of the scale, as a fraction of its initial value.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     scale_prior_sigma: float = 1.0
 
     #: Prior standard deviation of the shift, as a fraction of the references' median.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     shift_prior_sigma: float = 0.5
 
     #: Least scale of a head, as a fraction of its initial value.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     min_scale: float = 0.05
 
     #: Least value of a head, m or 1/m.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     min_head: float = 1e-3
 
     #: Prior log probability that a model loses for every kind of error that it has.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     complexity_log_penalty: float = 3.0
 
     #: Iterations of a fit for model selection.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     selection_steps: int = 10
 
     #: Iterations of the fit of the answer.
-    #: Source: chosen on data=shared_scenes, align_study.json.
     final_steps: int = 40
 
     # Model selection and averaging
 
-    #: Fewest references of a fit, and of far answers that can refute a model. Source: origin not recorded.
+    #: Fewest references of a fit, and of far answers that can refute a model.
     min_references: int = 8
 
-    #: Most models that contribute to sigma. Source: origin not recorded.
+    #: Most models that contribute to sigma.
     max_models: int = 3
 
-    #: Grid step for what varies slowly over the picture, px. Source: origin not recorded.
+    #: Grid step for what varies slowly over the picture, px.
     field_stride_px: int = 8
 
     #: Relative error of near returns below which two models are not compared by how well they fit them.
-    #: Source: chosen on data=shared_scenes and data=streams, align_study.json and align_study_streams.json.
     exact_fit_error: float = 0.002
 
     #: A shift that fits near returns to ``exact_fit_error`` is rejected only if it raises the loss of far answers by
     #: more than this many standard errors; any other shift is rejected from one on.
-    #: Source: chosen on data=shared_scenes and data=streams, align_study.json and align_study_streams.json.
     veto_standard_errors: float = 2.0
 
-    #: Loss difference that rounding alone may cause. Source: origin not recorded.
+    #: Loss difference that rounding alone may cause.
     loss_rounding: float = 1e-6
 
-    #: Loss of a reference under a model that could not be fitted. Source: origin not recorded.
+    #: Loss of a reference under a model that could not be fitted.
     failed_fit_loss: float = 10.0
 
     #: Bounds of the factor on sigma that left-out references give.
-    #: Source: chosen on data=shared_scenes and data=streams, align_study.json and align_study_streams.json.
     sigma_scale_range: tuple[float, float] = (0.3, 4.0)
 
     #: Prior weight of a factor of 1 on sigma, in left-out references.
-    #: Source: chosen on data=shared_scenes and data=streams, align_study.json and align_study_streams.json.
     sigma_scale_prior: int = 20
 
     #: Least probability of a power law that adds to sigma: a smaller one changes no interval that holds nine of ten
     #: errors. Source: derived, 1 - 0.9.
     min_power_probability: float = 0.1
 
-    #: Iterations of the fit of a power law. Source: origin not recorded.
+    #: Iterations of the fit of a power law.
     power_steps: int = 30
 
     #: Relative error at which the initial fit of a head changes from least squares to least absolute values.
-    #: Source: origin not recorded.
     huber_bend: float = 0.03
 
     # Family of the map
 
-    #: Fewest near returns that show that inverse depth is linear in the values, not depth. Source: origin not recorded.
+    #: Fewest near returns that show that inverse depth is linear in the values, not depth.
     family_min_references: int = 50
 
     #: Median relative error of a line from value to depth up to which the map is one of depth.
@@ -162,39 +139,30 @@ class AlignmentOptions:
     # Residual noise
 
     #: Relative scatter of a map without near returns.
-    #: Source: origin not recorded.
     default_residual: float = 0.01
 
     #: Error per unit of roughness (both log depth) of a map without near returns.
-    #: Source: origin not recorded.
     default_roughness_gain: float = 0.5
 
     #: Side of the window over which roughness is averaged, as a fraction of the longer side.
-    #: Source: origin not recorded.
     roughness_window: float = 0.03
 
     #: Candidate levels of relative error: exponents of ten from, to, and number.
-    #: Source: origin not recorded.
     error_levels: tuple[int, int, int] = (-5, 0, 51)
 
     #: Candidate levels of error per roughness: exponents of ten from, to, and number.
-    #: Source: origin not recorded.
     roughness_levels: tuple[int, int, int] = (-3, 1, 41)
 
     #: Width of the kernel of local errors over the picture, as a fraction of the longer side.
-    #: Source: origin not recorded.
     place_kernel_width: float = 0.04
 
     #: Width of the kernel of local errors over depth, log depth.
-    #: Source: origin not recorded.
     depth_kernel_width: float = 0.05
 
     #: Weight of zero local error, in returns, against the returns around a pixel.
-    #: Source: origin not recorded.
     empty_kernel_weight: float = 0.3
 
     #: Depth bins of the grid of local errors.
-    #: Source: origin not recorded.
     n_depth_bins: int = 48
 
     #: A return has a local error beyond this many sigmas of the map's scatter. Beyond two, chance leaves .08 of the
@@ -203,7 +171,6 @@ class AlignmentOptions:
     outlier_sigmas: float = 3.0
 
     #: Returns off by more than this many levels do not enter the estimate of the returns' noise.
-    #: Source: origin not recorded.
     outlier_levels: float = 3.0
 
     #: Unevenness of a map, as a fraction of the scatter of returns, below which it counts as even.

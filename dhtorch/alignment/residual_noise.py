@@ -58,7 +58,7 @@ def residual_variance(
     with torch.no_grad():
         near = points.used & points.near
         r = r - masked_median(r, near).maximum(-fit_sigma).minimum(fit_sigma)
-        deviation_map = _local_deviation(log, known, options)
+        deviation_map = log - _window_mean(log, known, _window_side(log, options))
         roughness = _window_mean(deviation_map.square(), known, _window_side(deviation_map, options)).sqrt()
         h = sample_at_references(roughness, points.share)[0].clamp_min(1e-9)
         rough = near & (h >= masked_median(h, near))
@@ -162,11 +162,6 @@ def _positive_part(total: Tensor, square: Tensor) -> Tensor:
     """Sum and its squared standard error -> shrunk sum: 0 below one error, nearly the whole beyond several (the
     positive part of James and Stein's estimate)."""
     return (total - square / total.clamp_min(1e-18)).clamp_min(0)
-
-
-def _local_deviation(x: Tensor, valid: Tensor, options: AlignmentOptions) -> Tensor:
-    """Difference (B, h, w) of pixels to the mean of the window around them."""
-    return x - _window_mean(x, valid, _window_side(x, options))
 
 
 def _side_lengths(x: Tensor) -> tuple[float, float]:

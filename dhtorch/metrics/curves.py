@@ -49,9 +49,8 @@ def sample_curves(pooled: Points) -> dict[str, Any]:
         "distance": distance,
         "reliability": {name: getattr(diagram, name).tolist() for name in ("claimed", "realised", "weight")},
     }
-    return {name: {k: _round_digits(v) for k, v in curve.items()} for name, curve in curves.items()}
-
-
-def _round_digits(values: list[float | None]) -> list[float | None]:
-    """Five significant digits: enough for a figure, short in a result file. NaN becomes None."""
-    return [None if v is None or math.isnan(v) else float(f"{v:.5g}") for v in values]
+    # Five significant digits: enough for a figure, short in a result file.
+    return {
+        name: {k: [None if v is None or math.isnan(v) else float(f"{v:.5g}") for v in x] for k, x in curve.items()}
+        for name, curve in curves.items()
+    }

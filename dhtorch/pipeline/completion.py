@@ -97,11 +97,8 @@ def complete_depth(
     else:
         estimate, depth_map = method.complete(method, reference, selected, **keywords, options=options)
     trace |= {"sparse": sparse, "fused": estimate}
-    return depth_map if calibration is None else _calibrate(depth_map, calibration)
-
-
-def _calibrate(depth_map: DepthMap, calibration: Calibration) -> DepthMap:
-    """The map with calibrated sigma and score of the pixels without a return."""
+    if calibration is None:
+        return depth_map
     sensed = depth_map.source == Source.SENSOR
     calibrated = calibration.apply(depth_map)
     return calibrated.replace(

@@ -382,21 +382,16 @@ def _gated(
     gate = torch.where(pair_gate != Gate.ANSWER, pair_gate, gate)
     keep = gate == Gate.ANSWER
     nan = torch.full_like(depth, torch.nan)
+    steep = depth.detach().square().square()  # m⁴, of a variance of q to one of depth
+    zero = torch.zeros_like(steep[:1, :1, :1]).expand_as(steep)  # the metric scale is added later
     return DepthMap(
         depth=torch.where(keep, depth, nan),
         sigma=torch.where(keep, sigma_rel * depth.detach(), nan),
         score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0),
         source=keep.int() * Source.SWEPT,
         gate=gate,
-        parts=_swept_parts(fitted, depth.detach()),
+        parts=SigmaBudget(fitted.own * steep, fitted.shared * steep, zero, zero, zero),
     )
-
-
-def _swept_parts(fitted: surface.RefinedSurface, depth: Tensor) -> SigmaBudget:
-    """Variances (B, h, w) of swept depths by cause: grey values and edges, motions; the metric scale is added later."""
-    steep = depth.square().square()  # m⁴, of a variance of q to one of depth
-    zero = torch.zeros_like(depth[:1, :1, :1]).expand_as(depth)
-    return SigmaBudget(fitted.own * steep, fitted.shared * steep, zero, zero, zero)
 
 
 def _returns(reference: Frame, method: MethodSpec, hw: tuple[int, int]) -> SensorReturns:

@@ -8,61 +8,49 @@ from typing import Final
 
 @dataclass(frozen=True)
 class DenseOptions:
-    """Options of :func:`dhtorch.pipeline.completion.complete_depth`: its tuning constants with their meaning, unit and
-    origin."""
+    """Options of :func:`dhtorch.pipeline.completion.complete_depth`: its tuning constants with their meaning and
+    unit."""
 
     # Defaults of the keywords of complete_depth
 
     #: Most source views that are swept, those of largest gain.
-    #: Source: origin not recorded.
     source_views: int = 3
 
     #: Inverse depths that are tested per pixel, evenly spaced from infinity to within the sensor's reach.
-    #: Source: origin not recorded.
     planes: int = 96
 
     #: Longer side of the map and of the images that are swept, px; smaller images keep their size.
-    #: Source: origin not recorded.
     size: int = 640
 
     #: Gauss-Newton steps from the best plane.
-    #: Source: origin not recorded.
     refinements: int = 2
 
     #: Correlation of a pixel's window in the view that fits best, below which the pixel is unanswered.
-    #: Source: origin not recorded.
     min_correlation: float = 0.75
 
     #: sigma / depth above which a pixel is unanswered, before the calibration.
-    #: Source: origin not recorded.
     max_sigma_rel: float = 0.2
 
     # Range of the sweep and source views
 
     #: Fraction of the sensor's reach at which the sweep ends; depths that both measure are needed to refute the sweep.
-    #: Source: origin not recorded.
     sweep_overlap: float = 0.7
 
     #: Quantile of the depth of near returns that is the sensor's reach.
-    #: Source: origin not recorded.
     reach_quantile: float = 0.98
 
     #: Least gain of a source view that is swept, Σ log(1 + (0.1 · depth / sigma)²) over its answers without a return.
-    #: Source: origin not recorded.
     min_view_gain: float = 5.0
 
     # Near returns against the sweep
 
     #: Fewest pixels with a near return and a swept depth by which a motion may be refuted.
-    #: Source: origin not recorded.
     min_overlap_pixels: int = 200
 
     #: Sigmas beyond which a difference of swept depth and near return counts as a contradiction.
-    #: Source: origin not recorded.
     refuting_sigmas: float = 3.0
 
     #: Difference of swept depth and near return, as a ratio to depth, beyond which it counts as a contradiction.
-    #: Source: origin not recorded.
     refuting_ratio: float = 0.1
 
     # Best plane
@@ -70,68 +58,54 @@ class DenseOptions:
     #: Least cost (of one view) by which the best plane along the ray must beat every plane further away in the images
     #: than ``second_best_radius_px``. The surroundings of a pixel contribute up to the price of a jump (18 from each
     #: side): a second best place within more than one such price may be the true one, as where a texture repeats.
-    #: Source: origin not recorded.
     min_second_best_margin: int = 5
 
     #: Displacement in the images within which another plane counts as the same place, px.
-    #: Source: origin not recorded.
     second_best_radius_px: float = 3.0
 
     #: Stride of the pixels from which the displacement between planes is measured; it reaches all rows and columns
-    #: alike. Source: origin not recorded.
+    #: alike.
     motion_stride_px: int = 17
 
     # Fit by grey values
 
     #: Noise of a pixel's grey value (a step of eight bits is 0.004).
-    #: Source: origin not recorded.
     grey_noise: float = 0.002
 
     #: Pixels of a window with independent errors: noise is correlated by the lens, the resampling and the texture.
-    #: Source: origin not recorded.
     independent_window_pixels: float = 5.0
 
     #: Cost of a surface (of one view, as :func:`dhtorch.geometry.plane_sweep.aggregate_best_plane` counts) at which the
     #: variance by grey values is not rescaled. Census codes that fit less well indicate other content in the window,
     #: those that fit better less noise.
-    #: Source: origin not recorded.
     nominal_cost: float = 40.0
 
     #: Correlation of its windows above which a view contributes to a pixel's depth.
-    #: Source: origin not recorded.
     min_window_correlation: float = 0.5
 
     #: Largest step of one Gauss-Newton iteration, planes.
-    #: Source: origin not recorded.
     max_step_planes: float = 1.0
 
     #: Largest distance of the fit from the best plane, planes.
-    #: Source: origin not recorded.
     max_total_planes: float = 1.5
 
     #: Planes by which a surface must be nearer to hide another.
-    #: Source: origin not recorded.
     occlusion_planes: float = 1.5
 
     #: Largest difference of neighbours on one surface, planes.
-    #: Source: origin not recorded.
     surface_planes: float = 1.5
 
     #: Half the distance of the central difference that gives the derivative of a step, planes.
-    #: Source: origin not recorded.
     derivative_planes: float = 0.1
 
     #: Least value of that derivative.
-    #: Source: origin not recorded.
     min_step_derivative: float = 0.25
 
     #: Radius of the window around a pixel whose range of inverse depth is an edge of the surface, px.
-    #: Source: origin not recorded.
     edge_radius_px: int = 4
 
     #: Standard deviation of a pixel's inverse depth beside an edge, as a ratio to the height of the edge: the pixel may
     #: belong to the other side.
-    #: Source: origin not recorded.
     edge_sigma_ratio: float = 0.17
 
     # Filters of the map

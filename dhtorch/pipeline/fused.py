@@ -36,10 +36,6 @@ FUSE_UNCERTAIN: Final = partial(
     fuse_consistent, sure_rel=0.3, sure_rel_each=0.3, max_sigma_rel=0.4, max_static_ratio=0.7
 )
 
-#: Fewest sparse answers without a return from which the error that they share is read, a count.
-#: Source: derived, a median of fewer is one answer's.
-MIN_SHARED_ANSWERS: Final = 9
-
 
 class FusedDepth(NamedTuple):
     """The joint answers of B reference views, at the samples and at all pixels."""
@@ -122,8 +118,11 @@ def fuse_with_sweep(
     uncertain = gate_sweep(sweep._replace(alone=torch.ones_like(sweep.alone)), wide)
     uncertain = _with_shared_error(uncertain, sweep, shared_q, half_error)
     at = cam.depth_pixels(reference.camera, reference.hw, None, sweep.base.hw, selected.samples.uv)
+    fused, joined = fuse_uncertain(selected.estimates), selected.joined
+    gate = torch.where(joined.gate == Gate.UNCERTAIN, fused.gate, joined.gate)
+    gate = torch.where(joined.keep, Gate.UNCERTAIN, gate)
     joint = _join(
-        (_sparse_answers(selected.joined), _sparse_answers(_fuse_views(selected, fuse_uncertain))),
+        (_sparse_answers(joined), _sparse_answers(fused.replace(gate=gate.to(torch.int32)))),
         (_swept_answers(swept, sweep, shared_q, at), _swept_answers(uncertain, sweep, shared_q, at)),
         limits=(max_agreeing_sigmas, min_conflicting_sigmas),
         factors=(agreement_gain, conflict_loss),
@@ -138,7 +137,8 @@ def _shared_error(selected: SelectedViews) -> Tensor:
     counts = joined.keep & ~selected.samples.usable & (joined.depth > 0)
     depth = torch.where(counts, joined.depth, 1.0)
     shared = masked_median((joined.sigma_shared / depth.square()).detach(), counts)
-    return torch.where(counts.sum(-1, keepdim=True) >= MIN_SHARED_ANSWERS, shared, 0.0)
+    # A median of fewer is one answer's.
+    return torch.where(counts.sum(-1, keepdim=True) >= 9, shared, 0.0)
 
 
 def _with_shared_error(swept: DepthMap, sweep: Sweep, shared_q: Tensor, half_error: float) -> DepthMap:
@@ -150,14 +150,6 @@ def _with_shared_error(swept: DepthMap, sweep: Sweep, shared_q: Tensor, half_err
     score = torch.where(swept.keep, half_error / (half_error + sigma / depth), 0.0)
     parts = None if swept.parts is None else swept.parts.replace(pose=swept.parts.pose + added)
     return swept.replace(sigma=sigma, score=score, parts=parts)
-
-
-def _fuse_views(selected: SelectedViews, fuse: Callable[..., Estimate]) -> Estimate:
-    """The joint answers (B, N) of the views by ``fuse``, for samples that the method left UNCERTAIN."""
-    fused, joined = fuse(selected.estimates), selected.joined
-    gate = torch.where(joined.gate == Gate.UNCERTAIN, fused.gate, joined.gate)
-    gate = torch.where(joined.keep, Gate.UNCERTAIN, gate)
-    return fused.replace(gate=gate.to(torch.int32))
 
 
 def _sparse_answers(estimate: Estimate) -> _Answers:

@@ -34,9 +34,6 @@ from dhtorch.pipeline.view_selection import rank_views, select_views_by_pose
 from dhtorch.pytree import stack
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, TrackHint, Tracks, ViewSelection
 
-#: Approximate number of samples by which views are selected. Source: origin not recorded.
-N_PREVIEW_SAMPLES = 256
-
 
 def estimate_multiview(
     method: MethodSpec,
@@ -92,7 +89,11 @@ def estimate_multiview(
         next_best = choice.reserve[:n_mute]
         traces, choice = _replace_mute_views(traces, estimate_views(next_best), choice, next_best)
     start_time = time.perf_counter()
-    traces = _verify_views(method, samples, traces)
+    if method.verify_views is not None:
+        verified = method.verify_views(
+            samples, *(stack([t[name] for t in traces]) for name in ("tracks_ideal", "fit", "estimate"))
+        )
+        traces = [{**t, "estimate": verified[k]} for k, t in enumerate(traces)]
     if samples.uv.shape[1] > n:
         traces = [without_added(t, n) for t in traces]
     last = traces[-1]
@@ -102,15 +103,6 @@ def estimate_multiview(
     if trace is not None:
         trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "choice": choice})
     return estimate
-
-
-def _verify_views(method: MethodSpec, samples: Samples, traces: list[Trace]) -> list[Trace]:
-    """The traces with the estimates that ``method.verify_views`` makes of all views' together."""
-    if method.verify_views is None:
-        return traces
-    inputs = (stack([t[name] for t in traces]) for name in ("tracks_ideal", "fit", "estimate"))
-    verified = method.verify_views(samples, *inputs)
-    return [{**t, "estimate": verified[k]} for k, t in enumerate(traces)]
 
 
 def _is_mute(traces: Sequence[Trace]) -> Tensor:
@@ -165,7 +157,8 @@ def _select_views(
     if method.select_views is not None:
         selection = method.select_views(reference, others, method.views, fit=fit)
         return selection if isinstance(selection, ViewSelection) else ViewSelection(selection)
-    preview = samples[:, :: max(1, method.n // N_PREVIEW_SAMPLES)]
+    # About 256 samples decide.
+    preview = samples[:, :: max(1, method.n // 256)]
     traces = _estimate_views(method, reference, others, preview, seed=seed, fit=fit, hint=hint, ms={})
     return rank_views(stack([t["estimate"] for t in traces]), method.views)
 
@@ -186,7 +179,9 @@ def _estimate_views(
     tracks: list[Tracks] = []
     for k, image in enumerate(others.image):
         if method.chain and tracks:
-            hint = hint.replace(start=_extrapolate_tracks(tracks[-1], (k + 1) / k))
+            uv_0, uv_1 = tracks[-1].uv_0.detach(), tracks[-1].uv_1.detach()
+            ahead = torch.where(tracks[-1].valid[..., None], uv_0 + (uv_1 - uv_0) * ((k + 1) / k), uv_0)
+            hint = hint.replace(start=ahead)
         tracks.append(clock("track", track_in_chunks(method, reference.image, image, samples.uv, hint)))
     V, B = others.image.shape[:2]
     solved = solve_pairs(
@@ -203,9 +198,3 @@ def _estimate_views(
     names = "tracks", "estimate", "tracks_ideal", "fit"
     by_view = dict(zip(names, (x.map(lambda y: y.unflatten(0, (V, B))) for x in solved), strict=True))
     return [{"ms": ms, "samples": samples, **{name: x[k] for name, x in by_view.items()}} for k in range(V)]
-
-
-def _extrapolate_tracks(tracks: Tracks, pace: float) -> Tensor:
-    """Start pixels (B, N, 2) of a track: the displacement of the last view's, times ``pace``."""
-    uv_0, uv_1 = tracks.uv_0.detach(), tracks.uv_1.detach()
-    return torch.where(tracks.valid[..., None], uv_0 + (uv_1 - uv_0) * pace, uv_0)

@@ -45,56 +45,6 @@ from dhtorch.stages.pose_prior import check_pose_prior, reject_poses
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import refine_tracks
 
-#: Most pairs tracked at once: more are no faster, and their pyramids cost memory. Source: origin not recorded.
-TRACK_CHUNK_PAIRS = 8
-
-#: The same on an accelerator. Source: derived, pyramids of 640×480 pixels in 700 MB.
-ACCELERATOR_CHUNK_PAIRS = 64
-
-#: Places, evenly spread over the image, among which :func:`sample_returns` finds returns, a count: a few returns in a
-#: thousand pixels are met. Source: derived, 10 of them where one pixel in eight hundred has a return.
-N_RETURN_PLACES = 8192
-
-#: Fraction of the tracks with less motion than ``STATIC_FLOW_PX`` above which the camera stood still. Objects that move
-#: in front of it are not the background, which only near returns could distinguish otherwise.
-#: Source: origin not recorded.
-STATIC_RATIO = 0.7
-
-#: Fewest tracks from which a camera that stood still is detected. Source: origin not recorded.
-MIN_STATIC_TRACKS = 16
-
-#: Motion below which a track counts as static, px. Source: origin not recorded.
-STATIC_FLOW_PX = 0.25
-
-#: Pyramid levels of a track that begins at a predicted place. Source: origin not recorded.
-GUIDED_LEVELS = 2
-
-#: Largest distances of tracks from where a pose allows, of a ray with z = 1: of a prior's pose, then of the pose
-#: refined from it. Source: derived, ``MAX_START_RESIDUAL`` and the residual that ``check_pose_prior`` always tolerates.
-GUIDED_TOLERANCES = (0.04, 0.005)
-
-#: Largest turn between a prior's pose and that of the near returns for the two to agree, rad: twice the arm's.
-#: Source: chosen on apc_arm, whose poses are off by .4 to 1.1 degrees.
-MAX_PRIOR_TURN_RAD = 0.04
-
-#: Largest distance between them, as a fraction of the translation; a moving foreground is off by more than half.
-#: Source: chosen on apc_arm, whose poses are off by 2 to 8 of 80 mm.
-MAX_PRIOR_SHIFT_RATIO = 0.25
-
-#: Views that answer a sample from which on it is not searched for, a count. Source: derived, two can agree.
-ENOUGH_VIEWS = 2
-
-#: Least correlation of a match in a view that is used as a track of its own. Source: origin not recorded.
-MIN_MATCH_NCC = 0.7
-
-#: Largest residual of near returns under a pose that is only a start, for a ray with z = 1.
-#: Source: origin not recorded.
-MAX_START_RESIDUAL = 0.04
-
-#: Fewest near inliers of a pose refined from a start, if near returns have no pose of their own: fewer fit almost any
-#: pose. Source: origin not recorded.
-MIN_NEAR_INLIERS = 8
-
 
 def estimate_pair(
     method: MethodSpec,
@@ -143,7 +93,8 @@ def sample_returns(method: MethodSpec, frame: Frame, n: int) -> Samples:
     The rest of the n has trackability 0, with which no sample is used. Gradient: as stages 2 and 3 of the method.
     """
     like = frame.camera.f
-    uv = spiral(frame.hw, N_RETURN_PLACES, foveation=0.5, device=like.device, dtype=like.dtype)
+    # 8192 places, evenly spread: 10 of them meet a return where one pixel in eight hundred has one.
+    uv = spiral(frame.hw, 8192, foveation=0.5, device=like.device, dtype=like.dtype)
     places = method.sample_depth_at(frame, uv)
     is_usable = places.usable & (places.trackability >= method.min_trackability)
     count = is_usable.sum(-1, keepdim=True)
@@ -185,7 +136,8 @@ def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Te
     def track_chunk(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
         return method.track(image_0, image_1, uv, hint=hint)
 
-    size = TRACK_CHUNK_PAIRS if image_0.is_cpu else ACCELERATOR_CHUNK_PAIRS
+    # More pairs at once are no faster, and their pyramids cost memory: 64 of 640×480 pixels, 700 MB.
+    size = 8 if image_0.is_cpu else 64
     return chunked_apply(track_chunk, size, image_0, image_1, uv, hint)
 
 
@@ -231,8 +183,11 @@ def solve_pairs(
     def solve(tracks: Tracks, use: PoseFit | PosePrior | None) -> Solved:
         run = partial(solve_pose_and_triangulate, samples=samples, tracks=tracks, seed=seed, clock=clock)
         estimate, usable, pose = run(method, camera_0=cameras[0], camera_1=cameras[1], fit=use)
-        unmoved = None if method.guide is None or use is None else _without_far_noise(method)
-        if unmoved is not None and isinstance(fit, PosePrior):
+        stage = method.triangulate
+        limited = isinstance(stage, partial) and stage.keywords.get("max_far_noise") is not None
+        if limited and method.guide is not None and use is not None and isinstance(fit, PosePrior):
+            # Without the limit on far noise, from which near returns count as moving.
+            unmoved = replace(method, triangulate=partial(stage, max_far_noise=None))
             free, _, _ = run(unmoved, camera_0=cameras[0], camera_1=cameras[1], fit=pose)
             estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
         return tracks, estimate, usable, pose
@@ -244,7 +199,9 @@ def solve_pairs(
     solved = solve(tracks, None)
     start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
     T, uses = fit.T_1_from_0, [] if isinstance(fit, InitialPose) else [fit]
-    for tolerance in GUIDED_TOLERANCES:
+    # Largest distances of tracks from where a pose allows, of a ray with z = 1: of a prior's pose (as of a start in
+    # ``_apply_prior``), then of the pose refined from it (what ``check_pose_prior`` always tolerates).
+    for tolerance in (0.04, 0.005):
         possible = _is_possible(samples, undistort_tracks(tracks, *cameras), *cameras, T, tolerance)
         matches = _search_matches(views, T, wanted=None)
         tracks = tracks.replace(valid=tracks.valid & possible)
@@ -255,21 +212,15 @@ def solve_pairs(
     return _answer_matches(views, solved, solve, clock)
 
 
-def _without_far_noise(method: MethodSpec) -> MethodSpec | None:
-    """The method without the limit on far noise, from which near returns count as moving; None if it has none."""
-    stage = method.triangulate
-    if not (isinstance(stage, partial) and stage.keywords.get("max_far_noise") is not None):
-        return None
-    return replace(method, triangulate=partial(stage, max_far_noise=None))
-
-
 def _agrees(fit: PoseFit, T_1_from_0: Pose) -> Tensor:
     """Whether poses (B,) are those of a prior up to its errors: near returns then do not move by themselves."""
     with torch.no_grad():
         T = select_batch(fit.ok, fit.T_1_from_0, T_1_from_0.to(fit.T_1_from_0.t.dtype))
         turn, shift = se3.log(se3.compose(T, se3.invert(T_1_from_0.to(T.t.dtype)))).split(3, -1)
-        near_turn = turn.norm(dim=-1) <= MAX_PRIOR_TURN_RAD
-        return fit.ok & near_turn & (shift.norm(dim=-1) <= MAX_PRIOR_SHIFT_RATIO * T_1_from_0.t.norm(dim=-1))
+        # Chosen on apc_arm, whose poses are off by .4 to 1.1 degrees and by 2 to 8 of 80 mm; a moving foreground is off
+        # by more than half the translation.
+        near_turn = turn.norm(dim=-1) <= 0.04
+        return fit.ok & near_turn & (shift.norm(dim=-1) <= 0.25 * T_1_from_0.t.norm(dim=-1))
 
 
 def _is_possible(
@@ -291,8 +242,10 @@ def _is_attached(method: MethodSpec, samples: Samples, tracks: Tracks) -> Tensor
     """Near returns (B, N) that do not move in the picture while most others do: parts of the camera's carrier."""
     with torch.no_grad():
         near = tracks.valid & samples.usable & (samples.trackability >= method.min_trackability)
-        static = near & ((tracks.uv_1 - tracks.uv_0).square().sum(-1) < STATIC_FLOW_PX**2)
-        return static & (static.sum(-1) < STATIC_RATIO * near.sum(-1))[:, None]
+        static = near & ((tracks.uv_1 - tracks.uv_0).square().sum(-1) < 0.25**2)
+        # Above this share the camera stood still: objects that move in front of it are not the background, which only
+        # near returns could distinguish otherwise.
+        return static & (static.sum(-1) < 0.7 * near.sum(-1))[:, None]
 
 
 def _search_matches(views: _Views, T_1_from_0: Pose, wanted: Tensor | None) -> GuidedMatches:
@@ -313,7 +266,7 @@ def _track_again(views: _Views, tracks: Tracks, matches: GuidedMatches, hint: Tr
     wanted = ~tracks.valid.unflatten(0, (V, B)) & known & matches.uv_1.isfinite().all(-1)
     outside = -2.0 * max(reference.hw)  # a point there costs nothing
     uv = torch.where(wanted[..., None], samples.uv.expand(V * B, -1, 2).unflatten(0, (V, B)), outside)
-    start = hint.replace(levels=GUIDED_LEVELS)
+    start = hint.replace(levels=2)  # a track begins at a predicted place
     new = collate(
         track_in_chunks(method, reference.image, image, uv[k], start.replace(start=matches.uv_1[k]))
         for k, image in enumerate(others.image)
@@ -338,17 +291,12 @@ def _most_answers(samples: Samples, results: list[Solved]) -> Solved:
     pair = torch.arange(len(best), device=best.device)
     tracks, estimates, usable, fits = (list(field) for field in zip(*results, strict=True))
     convention = fits[-1].matched_convention
-    has_shutter = any(fit.shutter is not None for fit in fits)
-    fits = [_with_shutter(fit, has_shutter).replace(matched_convention=None) for fit in fits]
+    if any(fit.shutter is not None for fit in fits):
+        still = [Shutter(torch.zeros_like(fit.T_1_from_0.t), F.pad(fit.cov, (0, 3, 0, 3))) for fit in fits]
+        fits = [fit.replace(shutter=fit.shutter or shutter) for fit, shutter in zip(fits, still, strict=True)]
+    fits = [fit.replace(matched_convention=None) for fit in fits]
     fit = stack(fits)[best, pair].replace(matched_convention=convention)
     return stack(tracks)[best, pair], stack(estimates)[best, pair], stack(usable)[best, pair], fit
-
-
-def _with_shutter(fit: PoseFit, wanted: bool) -> PoseFit:
-    """The fit with a global shutter where it has none and one is ``wanted``."""
-    if fit.shutter is not None or not wanted:
-        return fit
-    return fit.replace(shutter=Shutter(torch.zeros_like(fit.T_1_from_0.t), F.pad(fit.cov, (0, 3, 0, 3))))
 
 
 def _answer_matches(
@@ -363,10 +311,11 @@ def _answer_matches(
     V, B = others.image.shape[:2]
     textured = samples.trackability >= method.min_trackability
     answered = estimate.keep.unflatten(0, (V, B)).sum(0)
-    few = (answered < min(V, ENOUGH_VIEWS)) & (textured & ~samples.usable)[:B]
+    # A sample that two views answer is not searched for: two can agree.
+    few = (answered < min(V, 2)) & (textured & ~samples.usable)[:B]
     open_ = ~estimate.keep.unflatten(0, (V, B)) & few
     matches = _search_matches(views, fit.T_1_from_0, few)
-    matched = (open_ & matches.unique & (matches.ncc >= MIN_MATCH_NCC) & matches.uv_1.isfinite().all(-1)).flatten(0, 1)
+    matched = (open_ & matches.unique & (matches.ncc >= 0.7) & matches.uv_1.isfinite().all(-1)).flatten(0, 1)
     uv_1, cov, rms = (x.flatten(0, 1) for x in (_differentiable_places(views, matches), matches.cov, matches.rms))
     matched_tracks = tracks.replace(uv_1=uv_1, cov=cov, photometric=rms, error=cov[..., 0, 0].sqrt(), valid=matched)
     return solve(clock("guide", _select_points(matched, matched_tracks, tracks)), fit)
@@ -418,7 +367,11 @@ def solve_pose_and_triangulate(
         fit = solved if fit is None else _apply_prior(fit, solved, samples, usable, camera_0, camera_1)
         fit = fit.replace(code=torch.where(_is_static(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
         if (verify := method.verify) is not None:
-            fit = _verify(lambda pose: verify(samples, usable, pose, camera_0, camera_1), fit, solved)
+            refuted = fit.code == PoseCode.REFUTED
+            fit = verify(samples, usable, fit, camera_0, camera_1)
+            if any_possible(refuted):  # returns at wrong pixels do not refute a given pose
+                code = verify(samples, usable, solved, camera_0, camera_1).code
+                fit = fit.without_pose(refuted & (code == PoseCode.MISALIGNED), PoseCode.MISALIGNED)
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
@@ -430,24 +383,10 @@ def _is_static(fit: PoseFit, tracks: Tracks) -> Tensor:
     """Whether (B,) the camera stood still: no pose, and most tracks without motion."""
     with torch.no_grad():
         square_flow = (tracks.uv_1 - tracks.uv_0).square().sum(-1)
-        n_static = (tracks.valid & (square_flow < STATIC_FLOW_PX**2)).sum(-1)
+        n_static = (tracks.valid & (square_flow < 0.25**2)).sum(-1)
         n_tracks = tracks.valid.sum(-1)
         no_pose = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
-        return no_pose & (n_tracks >= MIN_STATIC_TRACKS) & (n_static > STATIC_RATIO * n_tracks)
-
-
-def _verify(
-    verify: Callable[[PoseFit], PoseFit],
-    fit: PoseFit,
-    solved: PoseFit,
-) -> PoseFit:
-    """The fit without the poses that ``verify`` rejects; returns at wrong pixels do not refute a given pose."""
-    verified = verify(fit)
-    refuted = fit.code == PoseCode.REFUTED
-    if not any_possible(refuted):
-        return verified
-    misaligned = refuted & (verify(solved).code == PoseCode.MISALIGNED)
-    return verified.without_pose(misaligned, PoseCode.MISALIGNED)
+        return no_pose & (n_tracks >= 16) & (n_static > 0.7 * n_tracks)
 
 
 def _apply_prior(
@@ -456,16 +395,15 @@ def _apply_prior(
     """The pose of a prior after the test by near returns; of an InitialPose, the most probable pose from that start."""
     if not isinstance(prior, InitialPose):
         return check_pose_prior(prior, samples, tracks, camera_0, camera_1, solved)
-    start = check_pose_prior(
-        prior.replace(cov=None), samples, tracks, camera_0, camera_1, solved, max_residual=MAX_START_RESIDUAL
-    )
+    start = check_pose_prior(prior.replace(cov=None), samples, tracks, camera_0, camera_1, solved, max_residual=0.04)
     no_draws = samples.uv.new_zeros(len(samples.uv), 1, 3)
     refined = map_pose(samples, tracks, camera_0, camera_1, no_draws, start=lambda *_: start).replace(
         matched_convention=start.matched_convention
     )
     # A search from a distant start may end at a pose that near returns contradict: it is tested like any other prior.
     end = PosePrior(refined.T_1_from_0)
-    checked = check_pose_prior(end, samples, tracks, camera_0, camera_1, solved, min_confirmed=MIN_NEAR_INLIERS)
+    # Fewer inliers fit almost any pose.
+    checked = check_pose_prior(end, samples, tracks, camera_0, camera_1, solved, min_confirmed=8)
     return reject_poses(refined, checked)
 
 

@@ -15,19 +15,6 @@ from dhtorch.stages.track import lucas_kanade
 
 _Chosen = TypeVar("_Chosen")
 
-#: Longer side of the pictures that are compared, px. Source: origin not recorded.
-_COMPARED_PX = 320
-
-#: Correlation of small pictures from which two may be of the same place. Source: origin not recorded.
-_MIN_CORRELATION = 0.4
-
-#: Median displacement of tracks between two pictures below which they are one, in px of ``_COMPARED_PX``. Source:
-#: derived, 1/8: neighbouring frames of a hand-held video at 30 Hz move by more.
-_SAME_PICTURE_PX = 0.125
-
-#: Most similar pictures that are compared whether they are the same one, a count. Source: origin not recorded.
-_CANDIDATES = 2
-
 
 def spread_evenly(items: Sequence[_Chosen], most: int) -> list[_Chosen]:
     """At most ``most`` items, evenly spread, the first and the last among them."""
@@ -42,7 +29,8 @@ def is_same_picture(a: Tensor, b: Tensor) -> bool:
     tracks = lucas_kanade(a, b, uv, levels=3, normalise="gain_bias")
     valid = tracks.valid[0]
     moved = (tracks.uv_1 - tracks.uv_0)[0][valid].norm(dim=-1)
-    return int(valid.sum()) >= 10 and bool(moved.median() < _SAME_PICTURE_PX)
+    # Neighbouring frames of a hand-held video at 30 Hz move by more than 1/8 px.
+    return int(valid.sum()) >= 10 and bool(moved.median() < 0.125)
 
 
 def match_pictures(
@@ -59,16 +47,16 @@ def match_pictures(
     for k, load in pictures.items():
         picture = load()
         alike = of_others @ _thumbnail(picture)
-        order = alike.argsort(descending=True)[:_CANDIDATES].tolist()
-        best = [numbers[i] for i in order if alike[i] > _MIN_CORRELATION]
+        order = alike.argsort(descending=True)[:2].tolist()
+        best = [numbers[i] for i in order if alike[i] > 0.4]
         same = [i for i in best if is_same_picture(picture, others[i]())]
         matches += [(k, i, bool(same)) for i in (same[:1] or best[:1])]
     return matches
 
 
 def _small(image: Tensor) -> Tensor:
-    """Picture (1, C, H, W) -> grey (1, 1, h, w) with the longer side ``_COMPARED_PX`` or less."""
-    factor = min(1.0, _COMPARED_PX / max(image.shape[-2:]))
+    """Picture (1, C, H, W) -> grey (1, 1, h, w) with the longer side 320 px or less."""
+    factor = min(1.0, 320 / max(image.shape[-2:]))
     hw = [max(32, round(s * factor)) for s in image.shape[-2:]]
     return torch.nn.functional.interpolate(grayscale(image), hw, mode="area")
 

@@ -47,10 +47,6 @@ MIN_PLANE_INVERSE_DEPTH = 1e-6
 #: shared scenes: half as many fill a tenth less, twice as many hardly more.
 _TRIPLES = ((5, 10, 1, 2), (4, 8, 2, 1), (3, 6, 2, 1))
 
-#: Cells that hypotheses are scored for at once: few enough for their support to stay in the cache; it changes no bit.
-#: Source: derived, five arrays of 64 support cells in 1 MB.
-CELLS_PER_BLOCK = 512
-
 #: Number of directions of rays that :data:`_TRIPLES` counts. Source: derived, a turn over its unit.
 _DIRECTIONS = 16
 
@@ -187,7 +183,15 @@ def _filled(*tensors: Any, options: DenseOptions) -> Sequence[Tensor]:
     with torch.no_grad():
         slots = _support_slots(cells, options)
     middle = _cell_middles(cells, options)
-    supports = _take(cells, slots, middle)
+    # The support (B, S, N) from its indices; its pixels are counted from the ``middle`` of the supported cell.
+    index = slots.clamp_min(0).flatten(1)
+
+    def take(x: Tensor) -> Tensor:
+        return x.flatten(1).gather(1, index).view(slots.shape)
+
+    supports = _Support(
+        take(cells.u) - middle[0], take(cells.v) - middle[1], take(cells.q), take(cells.variance), slots >= 0
+    )
     to_fill = _cell_sums(unanswered.float(), options) > 0
     planes = _fit_planes(
         supports, window_extreme(to_fill, options.plane_neighbours, torch.logical_or).flatten(1), options
@@ -291,18 +295,6 @@ def _support_slots(cells: _Cells, options: DenseOptions) -> Tensor:
     return torch.cat(rays).transpose(0, 1).flatten(2).long()
 
 
-def _take(cells: _Cells, slots: Tensor, middle: tuple[Tensor, Tensor]) -> _Support:
-    """The support (B, S, N) from its indices; its pixels are counted from the ``middle`` of the supported cell."""
-    index = slots.clamp_min(0).flatten(1)
-
-    def take(x: Tensor) -> Tensor:
-        return x.flatten(1).gather(1, index).view(slots.shape)
-
-    return _Support(
-        take(cells.u) - middle[0], take(cells.v) - middle[1], take(cells.q), take(cells.variance), slots >= 0
-    )
-
-
 def _triples(per_ray: int) -> list[tuple[int, int, int]]:
     """Slots of the three support cells of each hypothesis."""
     out = []
@@ -327,7 +319,8 @@ def _best_hypothesis(support: _Support, wanted: Tensor, options: DenseOptions) -
         return _cheapest_plane(support, options) & wanted[:, None]
     inlier = torch.zeros_like(support.exists)
     for k in range(len(wanted)):  # view by view: the sums then depend on no batch mate
-        for index in wanted[k].nonzero()[:, 0].split(CELLS_PER_BLOCK):
+        # Few enough cells at once for their support (five arrays of 64) to stay in a cache of 1 MB; it changes no bit.
+        for index in wanted[k].nonzero()[:, 0].split(512):
             block = _Support(*(x[k : k + 1, :, index] for x in support))
             inlier[k : k + 1, :, index] = _cheapest_plane(block, options)
     return inlier

@@ -19,18 +19,6 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.records import PoseFit
 
-#: Least inverse depth that the variance by a motion divides by, 1/m. Source: origin not recorded.
-MIN_INVERSE_DEPTH = 1e-6
-
-#: Least squared motion of a pixel that the variance by a motion divides by, (px·m)². Source: origin not recorded.
-MIN_SQUARED_MOTION = 1e-12
-
-#: Least absolute depth that the variance by a motion divides by, m. Source: origin not recorded.
-MIN_ABS_DEPTH = 1e-9
-
-#: Least sum of weights that a step is divided by, below any weight of a view, m². Source: origin not recorded.
-MIN_WEIGHT = 1e-37
-
 
 class SourceView(NamedTuple):
     """A view that is swept, with its pose and the covariance of that."""
@@ -189,7 +177,8 @@ def _joint_step(
         before = (None,) * len(_ViewSums._fields) if sums is None else sums
         sums = _add_to_sums(*columns, visible, max_step, pose_var, *before, options=options)
     assert sums is not None
-    return sums.step / sums.weight.clamp_min(MIN_WEIGHT), sums
+    # Below any weight of a view: no division by 0.
+    return sums.step / sums.weight.clamp_min(1e-37), sums
 
 
 class _ViewSums(NamedTuple):
@@ -258,7 +247,8 @@ def pose_variance(
 def _pose_variance_kernel(*tensors: Tensor) -> Tensor:
     ray, q, R, t, f, cov, motion = tensors
     variance = torch.empty_like(q)
-    limits = MIN_INVERSE_DEPTH, MIN_SQUARED_MOTION, MIN_ABS_DEPTH
+    # Least inverse depth (1/m), squared motion of a pixel ((px·m)²) and depth (m) that are divided by.
+    limits = 1e-6, 1e-12, 1e-9
     ray_rows, motion_rows = (x.mT.contiguous() for x in (ray, motion))
     torch.ops.dhtorch.pose_variance.default(ray_rows, q, *(R, t, f), cov.contiguous(), motion_rows, variance, *limits)
     return variance
@@ -273,14 +263,14 @@ def _pose_variance(*tensors: Any) -> Tensor:
     """:func:`pose_variance` (B, N) of rays (B, N, 3) with ``motion`` (B, N, 2) px·m in a view with focal lengths f
     (B, 2), from the covariance (B, 6, 6) of its pose R, t, or (B, 9, 9) with a rolling shutter's rotation."""
     ray, q, R, t, f, cov, motion = tensors
-    q_safe = q.clamp_min(MIN_INVERSE_DEPTH)
+    q_safe = q.clamp_min(1e-6)
     x, y, z = (
         part / q_safe + t[:, None] for part, t in zip(plane_sweep.rotate_rays(R, ray), t.unbind(-1), strict=True)
     )
     du, dv = motion.unbind(-1)
-    inv_square = 1 / (du * du + dv * dv).clamp_min(MIN_SQUARED_MOTION)
+    inv_square = 1 / (du * du + dv * dv).clamp_min(1e-12)
     # derivative along the motion by the point, as epipolar.point_jacobians, one tensor per component
-    inv_z = 1 / torch.where(z.abs() < MIN_ABS_DEPTH, torch.full_like(z, MIN_ABS_DEPTH), z)
+    inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
     gx, gy = (f[:, None] * inv_z * d * inv_square for f, d in zip(f.unbind(-1), (du, dv), strict=True))
     gz = -(gx * x + gy * y) * inv_z
     rotation = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx

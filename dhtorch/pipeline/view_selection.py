@@ -28,14 +28,11 @@ from dhtorch.pipeline.pair import (
     upcast_intrinsics,
 )
 from dhtorch.pipeline.spec import MethodSpec
-from dhtorch.records import NO_HINT, Estimate, Frame, Pose, PoseFit, PosePrior, Samples, Tracks, ViewSelection
+from dhtorch.records import NO_HINT, Estimate, Frame, Pose, PoseFit, PosePrior, Tracks, ViewSelection
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
-
-#: Longest side of the images on which candidates are compared, px. Source: origin not recorded.
-PREVIEW_SIDE_PX = 240
 
 #: Method of the previews: every estimate with a sigma counts, weighted by it. Few samples, few hypotheses and no
 #: rolling-shutter rotation are enough to order views, where accurate points are not needed.
@@ -48,25 +45,13 @@ PREVIEW_METHOD = MethodSpec(
 )
 
 
-#: Turn of a line of sight at which a window is recognised with e^-1/2 of the certainty, rad.
-#: Source: origin not recorded.
-RECOGNISED_TURN_RAD = 0.2
-
-#: Standard deviation of a track by which parallax becomes information, px. Source: origin not recorded.
-PREVIEW_TRACK_NOISE_PX = 1.0
-
-#: Weight of a view's tracks beside its gain: small enough to order equal gains alone.
-#: Source: derived, gains differ by more than 1e-6 where they differ, and a sum over 256 tracks is below 2000.
-TIE_WEIGHT = 1e-10
-
-
 def select_views_by_preview(
     reference: Frame,
     others: Frame,  # (V, B)
     views: int,
     *,
     fit: PoseFit | PosePrior | None = None,  # (V, B)
-    long: int = PREVIEW_SIDE_PX,
+    long: int = 240,
     near: int = 128,
     good_sigma_rel: float = 0.1,
     prefer_tracked: bool = True,
@@ -99,13 +84,16 @@ def select_views_by_preview(
     with torch.no_grad():
         reference, scale = downscale_frame(reference, long)
         V, B = others.image.shape[:2]
-        samples = _preview_samples(reference, near)
+        samples = PREVIEW_METHOD.sample_depth(reference)
+        if near > 0:
+            samples = pytree.collate((samples, sample_returns(PREVIEW_METHOD, reference, near)), dim=1)
+        references, samples = repeat_views(reference, V), repeat_views(samples, V)
         flat = downscale_frame(others.map(lambda x: x.flatten(0, 1)), long)[0]
-        estimate, tracks = _preview_pairs(
-            repeat_views(reference, V),
-            repeat_views(samples, V),
-            flat,
-            None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
+        fit = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
+        tracks = track_in_chunks(PREVIEW_METHOD, references.image, flat.image, samples.uv, NO_HINT)
+        cameras = references.camera, flat.camera
+        estimate, tracks, _ = solve_pose_and_triangulate(
+            PREVIEW_METHOD, samples, tracks, *cameras, seed=0, fit=fit, clock=StageTimer(None)
         )
         estimate = estimate.map(lambda x: x[:, : PREVIEW_METHOD.n].unflatten(0, (V, B)))
         motion = tracked_motion(tracks, long).unflatten(0, (V, B)) if prefer_tracked else None
@@ -158,26 +146,10 @@ def _information(xyz: Tensor, frame: Frame, T: Pose, good_sigma_rel: float) -> T
     shown = (there[..., 2] > 0) & is_inside_picture(pixel, frame.image)
     line = F.normalize(se3.rotate(T.R, xyz), dim=-1)
     turn = (line * F.normalize(there, dim=-1)).sum(-1).clamp(-1, 1).acos()
-    precision = good_sigma_rel * turn * frame.camera.f.amin(-1)[:, None] / PREVIEW_TRACK_NOISE_PX
-    seen = (-0.5 * (turn / RECOGNISED_TURN_RAD).square()).exp()
+    precision = good_sigma_rel * turn * frame.camera.f.amin(-1)[:, None]  # with tracks to 1 px
+    # At a turn of 0.2 rad a window is recognised with e^-1/2 of the certainty.
+    seen = (-0.5 * (turn / 0.2).square()).exp()
     return torch.where(shown, (precision * seen).square(), 0.0).nan_to_num(0.0)
-
-
-def _preview_samples(frame: Frame, near: int) -> Samples:
-    """Samples (B, N) of :data:`PREVIEW_METHOD`, then ``near`` at near returns."""
-    even = PREVIEW_METHOD.sample_depth(frame)
-    return pytree.collate((even, sample_returns(PREVIEW_METHOD, frame, near)), dim=1) if near > 0 else even
-
-
-def _preview_pairs(
-    references: Frame, samples: Samples, others: Frame, fit: PoseFit | PosePrior | None
-) -> tuple[Estimate, Tracks]:
-    """Estimates and tracks (P, N) of pairs of small images."""
-    tracks = track_in_chunks(PREVIEW_METHOD, references.image, others.image, samples.uv, NO_HINT)
-    estimate, usable, _ = solve_pose_and_triangulate(
-        PREVIEW_METHOD, samples, tracks, references.camera, others.camera, seed=0, fit=fit, clock=StageTimer(None)
-    )
-    return estimate, usable
 
 
 def tracked_motion(tracks: Tracks, long: int) -> Tensor:
@@ -230,7 +202,8 @@ def rank_views(
     is_answered = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
     ratio = good_sigma_rel * estimates.depth / torch.where(is_answered, estimates.sigma, 1.0)
     information = torch.where(is_answered, ratio, 0.0).detach().double().square()
-    preference = None if motion is None else TIE_WEIGHT * motion.detach().double()
+    # Small enough to order equal gains alone: gains differ by more than 1e-6, and a sum over 256 tracks is below 2000.
+    preference = None if motion is None else 1e-10 * motion.detach().double()
     selection = _select_greedily(information, views, preference, reserve)
     return selection.replace(no_answer=~is_answered.any(-1))
 

@@ -33,20 +33,13 @@ from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
 from dhtorch.ops.dispatch import operator
 from dhtorch.records import Camera, Frame, Samples
 
-#: Limits the search for a return in a sparse depth map: Chebyshev radius in depth pixels.
-#: Source: derived, (7 − 1) / 2 of the 7×7 windows in which ``metrics.holdout`` reads sparse returns.
-SPARSE_SEARCH_PX = 3
-
 #: Side of the neighbourhood for appearance flags and depth edges, px.
-#: Source: origin not recorded.
 NEIGHBOURHOOD_PX = 5
 
 #: Limits the colour of a highlight: difference of its channels as a fraction of the largest, without unit.
-#: Source: origin not recorded.
 MAX_HIGHLIGHT_COLOUR_REL = 0.15
 
 #: Least excess of a highlight over the mean of its neighbourhood, as a fraction of the range of grey values.
-#: Source: origin not recorded.
 MIN_HIGHLIGHT_CONTRAST = 0.1
 
 
@@ -76,7 +69,7 @@ def backproject(
         near_limit: m, None = none; returns beyond it stay in ``depth`` but get NaN in ``xyz`` and BEYOND_NEAR.
         min_conf: lowest accepted sensor confidence (0, 1, 2) where the frame has a confidence map.
         sigma_m, sigma_rel: sensor noise, sigma² = sigma_m² + (sigma_rel · z)².
-        search_px: radius of the search for a return, depth pixels; None = :data:`SPARSE_SEARCH_PX` in frames that are
+        search_px: radius of the search for a return, depth pixels; None = 3 in frames that are
             ``sparse``, else 0.
         edge_rel: max / min − 1 of the returns in the 5×5 neighbourhood (or as far as is searched, where that is
             farther) above which DEPTH_EDGE is set.
@@ -223,7 +216,8 @@ def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: Re
     pixel = containing_pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
-        pairs = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True)
+        # 3 depth pixels, the 7×7 windows in which ``metrics.holdout`` reads sparse returns.
+        pairs = zip(_read_depth(frame, uv, pixel, 3, limits.edge_rel), (depth, level, edge), strict=True)
         depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in pairs)
     border, dark, saturated, specular = _appearance(frame.image, pixel, limits)
     has_return = depth > 0

@@ -30,31 +30,6 @@ if TYPE_CHECKING:
 #: Source: derived, a constant and two slopes.
 _PLANE_PARAMETERS = 3
 
-#: Weight with which slopes are held at zero, in matches at the distance of the farthest, without unit.
-#: Source: chosen on the built-in rooms, see tests/stages/test_features.py.
-_SLOPE_WEIGHT = 0.03
-
-#: Reweighted steps of the fit, a count.
-#: Source: chosen on the built-in rooms, see tests/stages/test_features.py.
-_FIT_STEPS = 4
-
-#: Residual at which a match's weight has fallen to a quarter, in standard deviations of its neighbours' residuals.
-#: Source: COST_BEND of stage 5, the same kernel.
-_BEND = 2.0
-
-
-#: Variance of normal residuals under the fit's weights, as a share of their variance, without unit.
-#: Source: derived, E[w r²] / (2 E[w]) of a normal vector r with w = (1 + r² / bend²)⁻².
-WEIGHTED_VARIANCE = 0.606
-
-#: Largest ratio of the distances to the first and second nearest descriptor of a match, without unit.
-#: Source: Lowe's ratio, loosened: a sample needs agreeing neighbours as well.
-MAX_DESCRIPTOR_RATIO = 0.95
-
-#: Least spread of residuals by which matches are weighted, px: rounding of keypoints to whole pixels.
-#: Source: derived, the standard deviation of an even distribution over one pixel.
-MIN_SPREAD_PX = 0.29
-
 
 class _Matches(NamedTuple):
     """Matches of a pair of pictures."""
@@ -159,7 +134,8 @@ def _find_matches(
         return _as_matches(output["keypoints0"], output["keypoints1"], *lafs)
     if isinstance(matcher, feature.LocalFeature):
         (lafs_0, d_0), (lafs_1, d_1) = (_described_lafs(matcher, grayscale(x)) for x in (image_0, image_1))
-        pairs = feature.match_smnn(d_0, d_1, MAX_DESCRIPTOR_RATIO)[1]
+        # Lowe's ratio, loosened: a sample needs agreeing neighbours as well.
+        pairs = feature.match_smnn(d_0, d_1, 0.95)[1]
         lafs_0, lafs_1 = lafs_0[pairs[:, 0]], lafs_1[pairs[:, 1]]
         return _as_matches(lafs_0[..., 2], lafs_1[..., 2], lafs_0[None], lafs_1[None])
     if isinstance(matcher, feature.DISK | feature.ALIKED):
@@ -219,12 +195,14 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     scale = distance[:, -1:].clamp_min(1.0)
     X = torch.cat((torch.ones_like(o[..., :1]), o / scale[..., None]), -1)
     near = (-(distance**2) / scale**2).exp()
-    ridge = _SLOPE_WEIGHT * torch.diag(constant(X, [0.0, 1, 1]))
+    # Slopes are held at zero, in matches at the distance of the farthest (0.03 and 4 steps: chosen on built-in rooms).
+    ridge = 0.03 * torch.diag(constant(X, [0.0, 1, 1]))
     residual = p - p.median(1, keepdim=True).values
-    for _ in range(_FIT_STEPS):
+    for _ in range(4):
         size = torch.linalg.vector_norm(residual, dim=-1)
         spread = size.median(-1, keepdim=True).values / (MEDIAN_2D * (1 - _PLANE_PARAMETERS / count) ** 0.5)
-        weight = near * (_BEND**2 / (_BEND**2 + (size / spread.clamp_min(MIN_SPREAD_PX)) ** 2)) ** 2
+        # The kernel of stage 5, COST_BEND = 2; keypoints are rounded to whole pixels, by .29 px on average.
+        weight = near * (4 / (4 + (size / spread.clamp_min(0.29)) ** 2)) ** 2
         normal = (X * weight[..., None]).mT @ X + ridge
         plane = torch.linalg.solve(normal, (X * weight[..., None]).mT @ p)
         residual = p - X @ plane
@@ -234,7 +212,8 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     freedom = (effective - _PLANE_PARAMETERS).clamp_min(1.0) / effective
     row = torch.linalg.solve(normal, constant(ridge, [1.0, 0, 0]).expand(len(x), 3)[..., None])[..., 0]
     leverage = ((X @ row[..., None])[..., 0] * weight).square().sum(-1)
-    cov = scatter * ((1 + leverage) / (freedom * WEIGHTED_VARIANCE))[:, None, None]
+    # E[w r²] / (2 E[w]) = .606 of a normal vector r with w = (1 + r² / bend²)⁻².
+    cov = scatter * ((1 + leverage) / (freedom * 0.606))[:, None, None]
     is_near = (distance[:, 0] <= reach_px) & (effective > _PLANE_PARAMETERS) & x.isfinite().all(-1)
     return plane[:, 0], cov, is_near
 

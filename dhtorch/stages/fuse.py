@@ -11,10 +11,6 @@ from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.checks import check
 from dhtorch.records import Estimate, SigmaBudget
 
-#: Limits the own part of a variance from below: a fraction of the whole, without unit, whatever the pose's part.
-#: Source: origin not recorded.
-MIN_FUSED_OWN_RATIO = 1e-3
-
 
 def inverse_variance(
     estimates: Estimate,  # (V, B, N), one per view
@@ -155,7 +151,9 @@ def fuse_consistent(
     )
     gate = first_reason((contradicted, Gate.INCONSISTENT), (sigma > max_rel * depth, Gate.UNCERTAIN))
     gate = torch.where(n_agreeing < 1, _furthest_reason(estimates.gate, answered), gate)
-    gate = _contradicted_gate(estimates, gate)
+    # More views are contradicted than answer: an independently moving foreground is near in all of them.
+    contradicted, answering = ((estimates.gate == x).any(-1).sum(0) for x in (Gate.CONTRADICTED, Gate.ANSWER))
+    gate = torch.where((contradicted > answering)[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
     parallax = torch.where(
         agreeing | (n_agreeing < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg)
     )
@@ -201,17 +199,6 @@ def _static_gate(estimates: Estimate, gate: Tensor, max_static_ratio: float) -> 
     """The gates (B, N); NO_BASELINE for all points of a reference view whose views mostly have none."""
     static = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_static_ratio * len(estimates.gate)
     return torch.where(static[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
-
-
-def _contradicted_gate(estimates: Estimate, gate: Tensor) -> Tensor:
-    """The gates (B, N); CONTRADICTED for all answers of a reference view with more CONTRADICTED than answering views.
-
-    An independently moving foreground is near in all of them.
-    """
-    contradicted = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
-    answering = (estimates.gate == Gate.ANSWER).any(-1).sum(0)
-    is_moving = contradicted > answering
-    return torch.where(is_moving[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
 
 
 def _joint_estimate(
@@ -274,7 +261,8 @@ def _inverse_depth(estimates: Estimate, answered: Tensor) -> tuple[Tensor, Tenso
     inverse = 1 / torch.where(answered, estimates.depth, one).double()
     total = torch.where(answered, estimates.sigma, one).double() * inverse * inverse
     shared = torch.where(answered, estimates.sigma_shared, 0 * one).double() * inverse * inverse
-    own = (total.square() - shared.square()).clamp_min(MIN_FUSED_OWN_RATIO * total.square()).sqrt()
+    # The own part of a variance is at least a thousandth, whatever the pose's part.
+    own = (total.square() - shared.square()).clamp_min(1e-3 * total.square()).sqrt()
     return inverse, own, shared
 
 

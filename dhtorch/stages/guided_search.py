@@ -25,21 +25,8 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
 from dhtorch.records import Camera, Samples
 
-#: Longest sides of the images that are searched, px, from coarse to fine. Source: chosen on the built-in rooms.
-SEARCH_SIDES_PX = (160, 320, 640)
-
 #: Widths of the windows on these images, in samples, odd. Source: chosen on the built-in rooms.
 SEARCH_WINDOWS = (7, 9, 11)
-
-#: Distance of a window's samples on these images, px of the image. Source: derived, windows of 21 to 28 px of 640.
-SEARCH_STRIDES_PX = (1.0, 1.0, 2.0)
-
-#: Points searched at once: their windows of one view take about a megabyte. Source: derived, fits the cache.
-SEARCH_CHUNK_POINTS = 96
-
-#: Hypotheses on the finer images, odd; their distance is a third of that on the image before.
-#: Source: derived, one distance before and after.
-FINE_HYPOTHESES = 7
 
 #: Half the distance over which the affine motion of a window is measured, px. Source: derived, half of a window.
 AFFINE_HALF_WIDTH_PX = 8.0
@@ -47,27 +34,6 @@ AFFINE_HALF_WIDTH_PX = 8.0
 #: Limits the depth of a hypothesis in the source view, as a fraction of that in the reference view.
 #: Source: derived, closer to the source view than a tenth: windows are magnified tenfold.
 MIN_DEPTH_IN_SOURCE = 0.1
-
-#: Standard deviation of a window's noise, grey values in [0, 1], that regularises flat windows.
-#: Source: derived, one step of 8 bits.
-WINDOW_NOISE = 1 / 255
-
-#: Least variance of a match along its line, px². Source: derived, a tenth of a pixel.
-MIN_MATCH_VARIANCE = 0.01
-
-#: Samples of a window that vary together, a count: those of 3 x 3, as interpolation and blur join them.
-#: Source: origin not recorded.
-CORRELATED_SAMPLES = 9
-
-#: Least bend of a correlation over three hypotheses, in correlation: no division by 0. Source: derived, float32.
-MIN_BEND = 1e-6
-
-#: Added to the costs that are compared, in correlation: below it costs do not differ. Source: chosen on the built-in
-#: rooms, where interpolation alone costs some hundredths.
-COST_FLOOR = 0.05
-
-#: Largest variance of a match, px². Source: derived, the distance of the coarse hypotheses.
-MAX_MATCH_VARIANCE = 25.0
 
 
 @record
@@ -175,9 +141,10 @@ def guided_search(
         searched = ~samples.usable & posed.any(0)[:, None]
         searched = searched if wanted is None else searched & wanted
         points = _points(samples, camera_0, cameras_1, T, posed, near_quantile)
+        # Longest sides, px, from coarse to fine; chosen on the built-in rooms.
         levels = [
             (downscale(image_0.detach(), side), [downscale(image.detach(), side) for image in images_1])
-            for side in SEARCH_SIDES_PX
+            for side in (160, 320, 640)
         ]
         V = len(images_1)
         empty = points.uv_0.new_zeros(1, searched.numel())
@@ -185,7 +152,8 @@ def guided_search(
 
         def search(uv_0: Tensor, q_max: Tensor, batch: Tensor, *segments: _Segment) -> tuple[Tensor, ...]:
             points = _Points(uv_0, q_max, batch, segments)
-            size = chunk_size(SEARCH_CHUNK_POINTS, uv_0)
+            # The windows of 96 points in one view take about a megabyte and fit the cache.
+            size = chunk_size(96, uv_0)
             chunks = [_search(levels, part, limits) for part in _split_points(points, size)]
             return tuple(torch.cat(field, -1) for field in zip(*chunks, strict=True))
 
@@ -285,7 +253,11 @@ def _search(
     n_posed = torch.stack([s.posed for s in points.segments]).sum(0)
     better_half = (n_posed // 2)[None, :, None]  # the last index of the better half of the views
     for level, (small_0, smalls_1) in enumerate(levels):
-        windows = _Windows(points.batch, small_0, _template(points, small_0, level), level)
+        # Windows (M, P) of the samples without their means.
+        u, v = _window_offsets(level, points.uv_0)
+        x, y = (((points.uv_0[i] - small_0.first) / small_0.scale)[:, None] + d for i, d in ((0, u), (1, v)))
+        template = _read_bilinear(small_0.grey, points.batch, x, y)
+        windows = _Windows(points.batch, small_0, template - template.mean(-1, keepdim=True), level)
         views = [_correlate(windows, s, q, small_1) for s, small_1 in zip(points.segments, smalls_1, strict=True)]
         ncc = torch.stack([view[0] for view in views])  # (V, M, K)
         ordered = ncc.clamp_min(0).sort(0, descending=True).values.cumsum(0)
@@ -297,20 +269,22 @@ def _search(
             # Between hypotheses a repeated texture fits equally well at its periods: local maxima are raised to the
             # vertex of the parabola through their neighbours.
             left, middle, right = joint[:, :-2], joint[:, 1:-1], joint[:, 2:]
-            bend = (2 * middle - left - right).clamp_min(MIN_BEND)
+            bend = (2 * middle - left - right).clamp_min(1e-6)
             vertex = middle + (right - left).square() / (8 * bend)
             is_peak = (middle >= left) & (middle >= right)
             peak = torch.cat((joint[:, :1], torch.where(is_peak, vertex, middle).clamp(max=1), joint[:, -1:]), 1)
             elsewhere = torch.where((place - k[:, None]).abs() >= limits.exclusion, peak, -1.0).amax(-1)
             best = peak.gather(1, k[:, None])[:, 0]
-            unique = (1 - best + COST_FLOOR) < limits.max_cost_ratio * (1 - elsewhere + COST_FLOOR)
+            # On the built-in rooms interpolation alone costs some hundredths: below .05 costs do not differ.
+            unique = (1 - best + 0.05) < limits.max_cost_ratio * (1 - elsewhere + 0.05)
         if level == 1:
             unique = unique & (score >= limits.min_ncc)
         if level == len(levels) - 1:
             break
         centre = q.gather(1, k[:, None])[:, 0] + _vertex(joint, k)[0] * step
         step = step / 3
-        reach = torch.arange(FINE_HYPOTHESES, device=q.device, dtype=q.dtype) - FINE_HYPOTHESES // 2
+        # 7 hypotheses at a third of the distance on the image before: one of those distances to both sides.
+        reach = torch.arange(7, device=q.device, dtype=q.dtype) - 3
         q = (centre[:, None] + reach * step[:, None]).clamp_min(0)
     spread = windows.template.square().mean(-1).sqrt()
     fields = _matches_of_views(views, q, joint, step, spread)
@@ -325,7 +299,8 @@ def _matches_of_views(
     The variance is that of the joint optimum: views share the reference view's window, so it does not shrink with
     their number.
     """
-    n = SEARCH_WINDOWS[-1] ** 2 / CORRELATED_SAMPLES
+    # Interpolation and blur join 3 x 3 samples.
+    n = SEARCH_WINDOWS[-1] ** 2 / 9
     score, k = joint.max(-1)
     offset, bend, inner = _vertex(joint, k)
     q_joint = q.gather(1, k[:, None])[:, 0] + offset * step
@@ -336,7 +311,8 @@ def _matches_of_views(
         ends = (place.gather(2, (inner + d).expand(2, *inner.shape))[..., 0] for d in (0, 1))
         pace = torch.sub(*ends).square().sum(0)
         rms = (1 - own.clamp(0, 1).square()).sqrt() * spread
-        variance = (variance_in_steps * pace).clamp(MIN_MATCH_VARIANCE, MAX_MATCH_VARIANCE)
+        # From a tenth of a pixel to the distance of the coarse hypotheses.
+        variance = (variance_in_steps * pace).clamp(0.01, 25.0)
         fields.append((q_joint, variance, own, rms))
     return tuple(torch.stack(x) for x in zip(*fields, strict=True))
 
@@ -345,7 +321,7 @@ def _vertex(score: Tensor, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Maximum k (M,) of scores (M, K) → offset (M,) of the parabola's vertex, its bend, and k kept from the ends."""
     inner = k.clamp(1, score.shape[1] - 2)[:, None]
     left, middle, right = (score.gather(1, inner + d)[:, 0] for d in (-1, 0, 1))
-    bend = (2 * middle - left - right).clamp_min(MIN_BEND)
+    bend = (2 * middle - left - right).clamp_min(1e-6)
     return torch.where(k == inner[:, 0], (0.5 * (right - left) / bend).clamp(-0.5, 0.5), 0.0), bend, inner
 
 
@@ -360,16 +336,9 @@ def _pixels(s: _Segment, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
 def _window_offsets(level: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Offsets u, v (P,) of a window's samples, small pixels."""
     width = SEARCH_WINDOWS[level]
-    axis = (torch.arange(width, device=like.device, dtype=like.dtype) - width // 2) * SEARCH_STRIDES_PX[level]
+    # Samples 1, 1 and 2 px apart: windows of 21 to 28 px of 640.
+    axis = (torch.arange(width, device=like.device, dtype=like.dtype) - width // 2) * (1.0, 1.0, 2.0)[level]
     return axis.repeat(width), axis.repeat_interleave(width)
-
-
-def _template(points: _Points, small: DownscaledImage, level: int) -> Tensor:
-    """Windows (M, P) of the samples without their means."""
-    u, v = _window_offsets(level, points.uv_0)
-    x, y = (((points.uv_0[i] - small.first) / small.scale)[:, None] + d for i, d in ((0, u), (1, v)))
-    template = _read_bilinear(small.grey, points.batch, x, y)
-    return template - template.mean(-1, keepdim=True)
 
 
 def _correlate(
@@ -388,7 +357,8 @@ def _correlate(
     x, y = (centre[i][..., None] + du[i][..., None] * u + dv[i][..., None] * v for i in (0, 1))
     window = _read_bilinear(small_1.grey, batch, x.flatten(1), y.flatten(1)).unflatten(1, (q.shape[1], -1))
     window = window - window.mean(-1, keepdim=True)
-    noise = len(u) * WINDOW_NOISE**2 / small_0.scale
+    # Noise of one step of 8 bits regularises flat windows.
+    noise = len(u) * (1 / 255) ** 2 / small_0.scale
     product = (window * template[:, None]).sum(-1)  # not a matrix product, whose sums depend on the batch
     energy = (template.square().sum(-1)[:, None] + noise) * (window.square().sum(-1) + noise)
     H, W = small_1.grey.shape[-2:]

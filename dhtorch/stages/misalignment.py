@@ -26,45 +26,13 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 
-#: Limits the pairs that are tested together, a count; each near return has a row for every attachment.
-#: Source: MAP_CHUNK_PAIRS of stage 5.
-TEST_CHUNK_PAIRS = 16
-
-#: Relative error of returns that is always tolerated, added to their own sigma: distortion and registration of sensors.
-#: Source: chosen on shared_scenes, the field cases and the built-in rooms, sound and with altered pictures.
-DEPTH_TOLERANCE_REL = 0.04
-
 #: Limits the influence of a residual, in standard deviations: where the robust cost bends.
 #: Source: FitOptions.bend, the same kernel.
 COST_BEND = 2.0
 
-#: Reweighted steps in which the scale of an inverse depth profile is fitted, a count.
-#: Source: origin not recorded.
-SCALE_STEPS = 4
-
-#: Least first ratio of :func:`reject_misaligned` with the rolling shutter undone, without unit.
-#: Source: chosen on shared_scenes, the field cases and the built-in rooms, sound and with altered pictures.
-MIN_ROLLING_UNEXPLAINED = 0.5
-
-#: Fewest near returns of a pair on which the test is made, a count.
-#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
-MIN_TESTED_RETURNS = 24
-
 #: Limits the near returns of a pair on which other attachments are tried, a count; more are thinned evenly.
 #: Source: derived, a quarter of the default samples; limits the time.
 MAX_ATTACHED_RETURNS = 512
-
-#: Least fraction of the near returns that another attachment must also have a return for, without unit.
-#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
-MIN_SHARED_RATIO = 0.25
-
-#: Least mean robust cost of the returns at their own pixels, in [0, 1], that another attachment may improve on.
-#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
-MIN_OWN_COST = 0.05
-
-#: Limits the direction error of points by the pose's own covariance up to which a pair is tested, rad: a pose stated
-#: with more leaves residuals that no depth explains. Source: derived, 1.5 px of a picture with f = 500 px.
-MAX_POSE_ANGLE = 0.003
 
 #: Cells (across, down) of the picture in which the inverse depth of returns is averaged for other attachments, a count.
 #: Source: chosen on shared_scenes, the field cases and the built-in rooms.
@@ -112,7 +80,7 @@ def reject_misaligned(
     tracks' own. Returns whose parallax hardly varies, or few of them, refute nothing.
 
     A shutter rate that was fitted to such pairs absorbs part of what the depths leave unexplained. So the first ratio
-    is taken with the rolling shutter as it is, and must also exceed :data:`MIN_ROLLING_UNEXPLAINED` where it is undone.
+    is taken with the rolling shutter as it is, and must also exceed .5 where it is undone.
 
     Args:
         samples, tracks, camera_0, camera_1: the inputs of stage 5.
@@ -135,7 +103,8 @@ def reject_misaligned(
         _reject, max_unexplained=max_unexplained, min_gain=min_gain, few_returns=few_returns, min_t_snr=min_t_snr
     )
     cameras = (cam.ideal(camera_0), cam.ideal(camera_1))
-    return chunked_apply(reject, TEST_CHUNK_PAIRS, fit, samples, tracks, *cameras)
+    # Each near return of a pair has a row for every attachment.
+    return chunked_apply(reject, 16, fit, samples, tracks, *cameras)
 
 
 def _reject(fit: PoseFit, *inputs: Samples | Tracks | Camera, **limits: float) -> PoseFit:
@@ -163,8 +132,11 @@ def _is_misaligned(
     p = masked_median(straight.p, straight.used)
     variance = fit.cov.diagonal(dim1=-2, dim2=-1).nan_to_num(0.0)
     rotation, translation = variance.split(3, -1)
-    is_exact = (rotation.mean(-1) + translation.mean(-1) * p[:, 0].nan_to_num(0.0).square()).sqrt() <= MAX_POSE_ANGLE
-    tested = fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+    # A pose stated to more than .003 rad (1.5 px at f = 500 px) leaves residuals that no depth explains.
+    is_exact = (rotation.mean(-1) + translation.mean(-1) * p[:, 0].nan_to_num(0.0).square()).sqrt() <= 0.003
+    # The limits of this test, here and in ``_attachment_gain``: chosen on shared_scenes, the field cases and the
+    # built-in rooms, sound and with altered pictures.
+    tested = fit.ok & is_exact & (n >= 24) & (fit.t_snr >= min_t_snr)
     if not any_possible(tested):
         return tested
     rolling = straight
@@ -172,7 +144,7 @@ def _is_misaligned(
         rolling = _near_parallax(samples, tracks, fit.replace(shutter=None), camera_0, camera_1)
     rejected = _unexplained_ratio(rolling) > max_unexplained + few_returns / n.clamp_min(1).sqrt()
     if fit.shutter is not None:
-        rejected = rejected & (_unexplained_ratio(straight) > MIN_ROLLING_UNEXPLAINED)
+        rejected = rejected & (_unexplained_ratio(straight) > 0.5)
     gain, n_shared = _attachment_gain(_thinned(straight), samples)
     rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
     return rejected & tested
@@ -197,7 +169,8 @@ def _parallax_kernel(*tensors: Any) -> _Parallax:
     uv, used = (torch.empty_like(inputs[k]) for k in (0, 2))
     noise = sigma.new_empty(len(sigma), 1)
     near = _Parallax(uv, p, q, a, variance_rel=variance_rel, noise=noise, used=used)
-    torch.ops.dhtorch.near_parallax.default(*inputs, *near, DEPTH_TOLERANCE_REL, MEDIAN_1D, MIN_NOISE_PX)
+    # .04 of depth is always tolerated beside the returns' own sigma: distortion and registration of sensors.
+    torch.ops.dhtorch.near_parallax.default(*inputs, *near, 0.04, MEDIAN_1D, MIN_NOISE_PX)
     return near
 
 
@@ -236,7 +209,7 @@ def _parallax(*tensors: Any) -> _Parallax:
     far = tracked & ~is_usable
     across = [torch.where(m.any(-1, keepdim=True), masked_median(geometry.residual_px, m), 0.0) for m in (used, far)]
     noise = (torch.maximum(*across) / MEDIAN_1D).clamp_min(MIN_NOISE_PX)
-    variance_rel = (sigma * p) ** 2 + DEPTH_TOLERANCE_REL**2
+    variance_rel = (sigma * p) ** 2 + 0.04**2
     return _Parallax(uv_0, p, q, a, variance_rel=variance_rel, noise=noise, used=used)
 
 
@@ -264,7 +237,8 @@ def _mean_cost_kernel(*tensors: Any) -> Tensor:
     p = inputs[4]
     cost = p.new_empty(p.shape[:2])
     start = p.new_empty(0, p.shape[1]) if scale is None else scale.contiguous()
-    torch.ops.dhtorch.profile_cost.default(*(x.contiguous() for x in inputs), start, cost, COST_BEND, SCALE_STEPS)
+    # In 4 reweighted steps.
+    torch.ops.dhtorch.profile_cost.default(*(x.contiguous() for x in inputs), start, cost, COST_BEND, 4)
     return cost
 
 
@@ -284,7 +258,7 @@ def _mean_cost(*tensors: Any) -> Tensor:
     square, variance = residuals(p if scale is None else scale[..., None] * p)
     if scale is not None:
         scale, a_squared = scale[..., None], a**2
-        for _ in range(SCALE_STEPS):
+        for _ in range(4):
             weight = a_squared / variance * (COST_BEND**2 / (COST_BEND**2 + square)) ** 2
             weight = torch.where(used, weight, 0.0) * p
             total = (weight * p).sum(-1, keepdim=True)
@@ -326,8 +300,8 @@ def _attachment_gain(near: _Parallax, samples: Samples) -> tuple[Tensor, Tensor]
     scale = torch.where(other_sum > 0, own_sum / torch.where(other_sum > 0, other_sum, 1.0), 1.0)
     cost = _profile_cost(near, other, used, scale)
     n = used.sum(-1)
-    testable = (n >= MIN_TESTED_RETURNS) & (n >= MIN_SHARED_RATIO * near.used.sum(-1, keepdim=True))
-    testable = testable & (own_cost > MIN_OWN_COST)
+    testable = (n >= 24) & (n >= 0.25 * near.used.sum(-1, keepdim=True))
+    testable = testable & (own_cost > 0.05)
     return torch.where(testable, cost / torch.where(own_cost > 0, own_cost, 1.0), torch.inf), n
 
 

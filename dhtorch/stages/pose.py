@@ -40,21 +40,11 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 
-#: Limits the pairs that :func:`pnp_ransac` solves together, a count: few enough for their temporaries to stay in cache.
-#: Source: origin not recorded.
-PNP_CHUNK_PAIRS = 16
-
 #: Limits the pairs that :func:`map_pose` solves together, a count; each track has ten columns.
-#: Source: origin not recorded.
 MAP_CHUNK_PAIRS = 16
 
 #: Limits the points of a pair in the search, a count; more are thinned evenly. The last steps use all points.
-#: Source: origin not recorded.
 MAX_SEARCH_POINTS = 256
-
-#: Least standard deviation of the noise, px: residuals of exact data are rounding.
-#: Source: origin not recorded.
-MIN_NOISE_SIGMA_PX = 1e-6
 
 
 def pnp_ransac(
@@ -150,7 +140,8 @@ def pnp_ransac(
         kernel_px=kernel_px,
     )
     inputs = (samples.xyz, tracks.uv_1, tracks.valid, cam.ideal(camera_1), draws.to(samples.xyz))
-    return chunked_apply(partial(run_without_grad, _fit, options), PNP_CHUNK_PAIRS, *inputs)
+    # Few enough pairs for their temporaries to stay in cache.
+    return chunked_apply(partial(run_without_grad, _fit, options), 16, *inputs)
 
 
 @dataclass(frozen=True)
@@ -189,12 +180,13 @@ def _near_pose_kernel(
     R, t, cov, rms, sigma, t_snr = (points.new_empty(B, *size) for size in ((3, 3), (3,), (6, 6), (), (), ()))
     inlier = torch.empty_like(usable)
     n_inlier, code = (torch.empty_like(valid, dtype=dtype) for dtype in (torch.int64, torch.int32))
+    # Least standard deviation of the noise, px: residuals of exact data are rounding.
     torch.ops.dhtorch.pose_last_step.default(
         *(points, usable, *lens, start.R, start.t, valid),
         *(R, t, cov, inlier, n_inlier, rms, sigma, t_snr, code),
         threshold_px=options.threshold_px,
         min_inlier=options.min_inlier,
-        min_sigma=MIN_NOISE_SIGMA_PX,
+        min_sigma=1e-6,
         min_depth=MIN_DEPTH,
         min_pivot=MIN_PIVOT,
         max_ratio=ransac.MAX_DISTANCE_RATIO,
@@ -255,7 +247,7 @@ def _near_pose(points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tens
         ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
         total = torch.where(inlier, square, 0.0).detach().sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
-        sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_NOISE_SIGMA_PX)
+        sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(1e-6)
         inverse = x[..., 1:]
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
         # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.

@@ -21,25 +21,8 @@ from dhtorch.geometry.least_squares import MIN_DEPTH, linearise, select_batch
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.records import Camera, Frame, InitialPose, Pose, PoseFit, PosePrior, Samples, Tracks
 
-#: Limits the near returns per pair that a refuted pose's conventions are tested on, a count; more are thinned evenly.
-#: Source: origin not recorded.
-MAX_CONVENTION_RETURNS = 256
-
 #: Limits the residual of an explained near return, in standard deviations.
-#: Source: origin not recorded.
 INLIER_SIGMAS = 3.0
-
-#: Standard deviation of a track, px, where it is not estimated.
-#: Source: origin not recorded.
-DEFAULT_TRACK_NOISE_PX = 1.0
-
-#: Factor on the standard deviations of stage 5, which are first-order and leave out errors common to all returns.
-#: Source: origin not recorded.
-FIT_SIGMA_INFLATION = 3.0
-
-#: Least length of a translation that counts as a baseline, in its own standard deviations.
-#: Source: origin not recorded.
-MIN_PRIOR_T_SNR = 1.0
 
 
 class _NearTracks(NamedTuple):
@@ -120,7 +103,8 @@ def check_pose_prior(
         if prior.cov is not None:
             finite = finite & prior.cov.isfinite().flatten(1).all(1)
         near = _near(samples, tracks)
-        floor_px = (max_residual * camera_1.f.detach().amin(-1)).clamp_min(DEFAULT_TRACK_NOISE_PX)
+        # Where the noise of tracks is not estimated it is taken as 1 px.
+        floor_px = (max_residual * camera_1.f.detach().amin(-1)).clamp_min(1.0)
         own = select_batch(fit.ok, fit.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
         prior_pose = select_batch(finite, T.detach(), se3.identity(len(T.t), T.t))
         own_cov = torch.where(fit.ok[:, None, None], fit.cov, 0.0).nan_to_num().to(T.t.dtype)
@@ -142,14 +126,18 @@ def check_pose_prior(
             )
         else:
             cov = prior_cov
-            deviates = covariance.mahalanobis(xi, prior_cov + FIT_SIGMA_INFLATION**2 * own_cov) > max_deviation
+            # Standard deviations of stage 5 are first-order and leave out errors common to all returns: times 3.
+            deviates = covariance.mahalanobis(xi, prior_cov + 9 * own_cov) > max_deviation
             refuted, no_baseline = refuted | (enough_near & fit.ok & deviates), torch.zeros_like(no_baseline)
-        t_snr = _t_snr(T.t, cov[:, 3:, 3:])
+        exact = ~(cov[:, 3:, 3:].abs().flatten(1).amax(1) > 0)
+        t_snr = covariance.mahalanobis(T.t, cov[:, 3:, 3:])
+        t_snr = torch.where(exact, torch.where((T.t != 0).any(-1), torch.inf, 0.0).to(T.t), t_snr)
         t_snr = torch.where(fit.ok, torch.maximum(t_snr, fit.t_snr.nan_to_num().to(t_snr)), t_snr)
+        # A baseline is at least as long as its own standard deviation.
         code = first_reason(
             (~finite, PoseCode.TOO_FEW),
             (refuted, PoseCode.REFUTED),
-            (no_baseline | ~(t_snr >= MIN_PRIOR_T_SNR), PoseCode.NO_BASELINE),
+            (no_baseline | ~(t_snr >= 1.0), PoseCode.NO_BASELINE),
             (unconfirmed, PoseCode.TOO_FEW),
             otherwise=PoseCode.OK,
         )
@@ -171,7 +159,7 @@ def check_pose_prior(
         inlier=(inlier & ok[:, None])[:, :N],
         n_inlier=inlier.sum(-1),
         rms_px=answer(rms_px),
-        sigma_px=answer(torch.where(fit.ok, fit.sigma_px.to(rms_px), DEFAULT_TRACK_NOISE_PX)),
+        sigma_px=answer(torch.where(fit.ok, fit.sigma_px.to(rms_px), 1.0)),
         t_snr=answer(t_snr),
         code=code,
         matched_convention=convention,
@@ -289,7 +277,8 @@ def _square(near: _NearTracks, T: Pose, camera: Camera, floor_px: Tensor | None,
 def _matched_convention(near: _NearTracks, hypotheses: Pose, camera: Camera, rigid: Tensor, floor_px: Tensor) -> Tensor:
     """Index (B,) of the convention that explains most of the rigid near returns, and at least half; 0 = none."""
     B, K = hypotheses.t.shape[:2]
-    index, count = ransac.usable_first(rigid, min(MAX_CONVENTION_RETURNS, rigid.shape[1]))
+    # More returns are thinned evenly.
+    index, count = ransac.usable_first(rigid, min(256, rigid.shape[1]))
     slot = torch.arange(index.shape[1], device=index.device) < count[:, None]
 
     def thin(x: Tensor) -> Tensor:
@@ -308,10 +297,3 @@ def _matched_convention(near: _NearTracks, hypotheses: Pose, camera: Camera, rig
     best = (cost <= cost.amin(-1, keepdim=True) + 0.05).int().argmax(-1)  # the simplest of those with equal fit
     fits = (cost.gather(-1, best[:, None])[:, 0] < 0.5) & (count > 0)
     return torch.where(fits, best, 0).to(torch.int32)
-
-
-def _t_snr(t: Tensor, cov: Tensor) -> Tensor:
-    """Translation in its own standard deviations (B,): infinite where exact and not zero."""
-    exact = ~(cov.abs().flatten(1).amax(1) > 0)
-    snr = covariance.mahalanobis(t, cov)
-    return torch.where(exact, torch.where((t != 0).any(-1), torch.inf, 0.0).to(t), snr)

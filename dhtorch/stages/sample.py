@@ -14,10 +14,6 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import is_transformed, keep_beside
 
-#: Step of the angle of a Vogel spiral, rad.
-#: Source: derived, π (3 − √5), the golden section of a full turn.
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-
 
 def spiral(
     hw: tuple[int, int],
@@ -112,7 +108,8 @@ def vogel_spiral(
     """
     box = _frame(hw, n, gaze, margin_px)
     k = torch.arange(n, dtype=torch.float64)
-    uv = _polar(box, GOLDEN_ANGLE * k, ((k + 0.5) / max(n, 1)).sqrt(), 0.0)
+    # π (3 − √5), the golden section of a full turn.
+    uv = _polar(box, math.pi * (3 - math.sqrt(5)) * k, ((k + 0.5) / max(n, 1)).sqrt(), 0.0)
     return uv.to(device=device, dtype=dtype)
 
 

@@ -19,20 +19,10 @@ from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 from dhtorch.runtime import storage
 
-#: Limits the own part of a variance, the whole less the pose's part, from below: a fraction of the whole without unit.
-#: Source: origin not recorded.
-MIN_SCORED_OWN_RATIO = 1e-6
-
-#: Limits relative errors and ratios from below, without unit: their squares stay in the range of float32.
-#: Source: origin not recorded.
-MIN_RATIO = 1e-6
-
 #: Limits relative errors and ratios from above, without unit: their squares stay in the range of float32.
-#: Source: origin not recorded.
 MAX_RATIO = 1e6
 
 #: Features of a learned score, each as a logarithm, and the limits to which their values are clamped, in their unit.
-#: Source: origin not recorded.
 SCORE_FEATURES: dict[str, tuple[float, float]] = {
     "expected_error": (1e-5, 1e2),  # e of confidence_from_error
     "shared_error": (1e-5, 1e2),  # the pose's part of sigma / depth
@@ -45,16 +35,7 @@ SCORE_FEATURES: dict[str, tuple[float, float]] = {
 }
 
 #: Limits the logarithm of the factor by which a learned score changes the expected error, without unit.
-#: Source: origin not recorded.
 MAX_LOG_FACTOR = 4.0
-
-#: Reprojection residual that contributes as much as a track's own noise, px.
-#: Source: origin not recorded.
-SCORE_RESIDUAL_PX = 0.5
-
-#: Round trip that contributes as much as a track's own noise, px.
-#: Source: origin not recorded.
-SCORE_ROUND_TRIP_PX = 0.4
 
 
 def confidence(
@@ -103,9 +84,9 @@ def confidence_from_error(
     tracks: Tracks,
     fit: PoseFit,
     *,
-    residual_scale_px: float = SCORE_RESIDUAL_PX,
+    residual_scale_px: float = 0.5,
     photometric_scale: float | None = None,
-    round_trip_scale_px: float | None = SCORE_ROUND_TRIP_PX,
+    round_trip_scale_px: float | None = 0.4,
     half_error: float = 0.1,
     recalibration: Callable[[Tensor], Tensor] | None = None,
     min_score: float = 0.0,
@@ -208,7 +189,7 @@ def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: Po
         valid=(tracks.valid, "B N"),
         inlier=(fit.inlier, "B N"),
     )
-    terms = [(estimate.residual_px, SCORE_RESIDUAL_PX), (tracks.error, SCORE_ROUND_TRIP_PX)]
+    terms = [(estimate.residual_px, 0.5), (tracks.error, 0.4)]
     expected, stated = _expected_error(estimate, terms)
     evidence = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
     for x in evidence:
@@ -353,9 +334,8 @@ def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tu
     inverse = 1 / torch.where(stated, depth, one)
     whole = (torch.where(stated, whole, one) * inverse).clamp(max=MAX_RATIO)
     shared = (torch.where(stated, shared, zero) * inverse).clamp(max=MAX_RATIO)
-    own = torch.maximum(whole * whole - shared * shared, MIN_SCORED_OWN_RATIO * whole * whole).clamp_min(
-        MIN_RATIO * MIN_RATIO
-    )
+    # The own part is at least 1e-6 of a variance; squares stay in the range of float32.
+    own = torch.maximum(whole * whole - shared * shared, 1e-6 * whole * whole).clamp_min(1e-12)
     spread = one
     for x, scale in terms:
         ratio = (torch.where(stated, x, zero) / scale).clamp(max=MAX_RATIO)

@@ -30,11 +30,6 @@ from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.pyramid import Pyramid, PyramidCache, build_pyramid
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
-#: Limits the start level of a search from a coarse flow: the first level (at least the second) whose windows are this
-#: many times as wide as the spacing of the flow's cells there, without unit.
-#: Source: derived, 4 / 5: four small pixels over the about five of a cell.
-START_LEVEL_MARGIN = 0.8
-
 #: Least eigenvalue of A per pixel of a window that is tracked, squared grey values in [0, 1] per px²; cv2 sums
 #: gradients of 8-bit images scaled by 2^-5.
 #: Source: OpenCV calcOpticalFlowPyrLK default minEigThreshold 1e-4, derived, times 2^10 / 255².
@@ -123,6 +118,10 @@ def lucas_kanade(
         flows = resolve_coarse_flow(image_0, image_1, hint, start)
         view = None if flows is None else _DerotatedImage(image_1, flows)
         target = build_pyramid(image_1 if view is None else view.image, levels, window)
+        near_levels = levels
+        if flows is not None:  # the first level (at least the second) whose windows are 4 / 5 as wide as a cell
+            cell_px = max(n / cells for n, cells in zip(source.hw(), flows[0].support.shape[1:], strict=True))
+            near_levels = max(2, 1 + math.ceil(math.log2(0.8 * cell_px / window)))
         tracks = run_without_grad(
             _track_both_ways,
             source,
@@ -131,7 +130,7 @@ def lucas_kanade(
             o,
             init=hint.start if view is None else view.begin(uv_0.detach(), hint.start),
             back_start_of=None if view is None else view.back,
-            near_levels=levels if flows is None else _levels_for_flow(flows[0], source.hw(), window),
+            near_levels=near_levels,
             limit_px=max_round_trip_px,
         )
         tracks = tracks if view is None else view.to_image(tracks)
@@ -286,12 +285,6 @@ def _track_both_ways(
         cov=grid(lk.window_covariance(A, squares / (o.window**2 - 2))),
         valid=grid(forward_ok & backward_ok & (error < limit_px)),
     )
-
-
-def _levels_for_flow(flow: CoarseFlow, hw: tuple[int, int], window: int) -> int:
-    """Pyramid levels of a search that starts from a coarse flow: until a window covers the error of the flow."""
-    cell_px = max(n / cells for n, cells in zip(hw, flow.support.shape[1:], strict=True))
-    return max(2, 1 + math.ceil(math.log2(START_LEVEL_MARGIN * cell_px / window)))
 
 
 def _finite(x: Tensor) -> Tensor:

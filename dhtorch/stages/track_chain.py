@@ -21,24 +21,6 @@ from dhtorch.geometry.checks import any_possible, check
 from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
-#: Limits the number of images between that are used by default: five hops.
-#: Source: chosen on ``data=shared_scenes`` (six video scenes), where the coverage of ``paper`` rose from .23 to .53;
-#: other numbers were not tried.
-BETWEEN_IMAGES = 4
-
-#: Distance of a registration from the chain's place, px, above which it is another structure.
-#: Source: derived, the ``max_shift_px`` of an affine registration from its track; on six video scenes of
-#: ``data=shared_scenes`` the coverage with 1 and 3 px was the same to .01.
-MAX_DRIFT_PX = 2.0
-
-#: Distance from the start, px, at which a track that could not be registered may end after the way back.
-#: Source: derived, 1 px of a single track times √5 for five hops.
-MAX_WAY_BACK_PX = 2.0
-
-#: Pixel coordinate outside every image, at which points that are not tracked are placed: they cost nothing.
-#: Source: derived, beyond the half pixel by which images reach over their outermost pixel centres.
-OUTSIDE_PX = -2.0
-
 
 class _Way(NamedTuple):
     """The images in their order, and what every search between two of them needs."""
@@ -52,7 +34,8 @@ class _Way(NamedTuple):
     ) -> Tracks:
         """Tracks from image ``j`` to image ``k`` of the points uv (B, N, 2) that are ``wanted`` (B, N)."""
         hint = TrackHint(start, self.pyramids[j], self.levels)
-        tracks = track(self.images[j], self.images[k], torch.where(wanted[..., None], uv, OUTSIDE_PX), hint=hint)
+        # Outside every image, points cost nothing.
+        tracks = track(self.images[j], self.images[k], torch.where(wanted[..., None], uv, -2.0), hint=hint)
         return tracks.replace(valid=tracks.valid & wanted)
 
 
@@ -64,10 +47,10 @@ def track_chain(
     hint: TrackHint = NO_HINT,
     track: Callable[..., Tracks],
     hop: Callable[..., Tracks] | None = None,
-    between: int = BETWEEN_IMAGES,
+    between: int = 4,
     register: bool = True,
-    max_drift_px: float = MAX_DRIFT_PX,
-    max_round_trip_px: float = MAX_WAY_BACK_PX,
+    max_drift_px: float = 2.0,
+    max_round_trip_px: float = 2.0,
     **options: Any,
 ) -> Tracks:
     """Tracks of points uv_0 from image 0 to image 1 through the images between, registered to image 0 at each.
@@ -80,10 +63,13 @@ def track_chain(
             ``flows`` are not used.
         track: any tracker of two images.
         hop: tracker of the hops from image to image. None = ``track``.
-        between: most images between that are used; of more, as many evenly spaced.
+        between: most images between that are used; of more, as many evenly spaced. With 4 (five hops) the coverage of
+            ``paper`` on six video scenes of ``data=shared_scenes`` rose from .23 to .53.
         register: search the window of image 0 in every image, from where the chain is. False = the hops alone.
-        max_drift_px: a registration further from the chain's place is not used.
-        max_round_trip_px: of tracks that are not registered in image 1, over the whole way back.
+        max_drift_px: a registration further from the chain's place is another structure and not used; with 1 and 3 px
+            coverage is the same to .01.
+        max_round_trip_px: of tracks that are not registered in image 1, over the whole way back: 1 px of a single track
+            times √5 for five hops.
         **options: of ``track``.
 
     Returns:
@@ -115,7 +101,12 @@ def track_chain(
     everywhere = torch.ones_like(uv_0[..., 0], dtype=torch.bool)
     tracks, registered = way.track(step, 0, 1, uv_0, everywhere), everywhere
     for k in range(2, len(images)):
-        tracks = _append_hop(tracks, way.track(hop or step, k - 1, k, tracks.uv_1, tracks.valid))
+        further = way.track(hop or step, k - 1, k, tracks.uv_1, tracks.valid)
+        tracks = further.replace(  # lost ones stay at their last place
+            uv_1=torch.where(tracks.valid[..., None], further.uv_1, tracks.uv_1),
+            error=tracks.error + further.error,
+            cov=tracks.cov + further.cov,
+        )
         registered = torch.zeros_like(everywhere)
         if register:
             is_last = k == len(images) - 1
@@ -146,17 +137,8 @@ def frames_between(i: int, j: int, most: int) -> list[int]:
 def images_used(track: Callable[..., Tracks]) -> int:
     """Number of images between the two of a pair that a tracker uses at most, 0 of one that tracks directly."""
     options = track.keywords if isinstance(track, partial) else {}
-    used: int = options.get("between", BETWEEN_IMAGES)
+    used: int = options.get("between", 4)
     return used if getattr(track, "func", track) is track_chain else 0
-
-
-def _append_hop(tracks: Tracks, hop: Tracks) -> Tracks:
-    """Tracks that go on by a hop: covariances and round trips add up; lost ones stay at their last place."""
-    return hop.replace(
-        uv_1=torch.where(tracks.valid[..., None], hop.uv_1, tracks.uv_1),
-        error=tracks.error + hop.error,
-        cov=tracks.cov + hop.cov,
-    )
 
 
 def _choose(chosen: Tensor, tracks: Tracks, others: Tracks) -> Tracks:

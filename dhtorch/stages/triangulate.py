@@ -18,10 +18,6 @@ from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
 from dhtorch.geometry.se3 import Pose
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, SigmaBudget, Tracks
 
-#: Limits the trackability (grey values in [0, 1]) that a grey difference is divided by from below: no division by 0.
-#: Source: origin not recorded.
-MIN_MISMATCH_TRACKABILITY = 1e-8
-
 
 def two_view(
     samples: Samples,
@@ -120,8 +116,10 @@ def two_view(
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _safe_pose(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
-    mismatch = grey_rms / texture.clamp_min(MIN_MISMATCH_TRACKABILITY).sqrt()
-    cov = _rescaled_covariance(cov, tracked, fit, isotropic) if fitted_noise else cov
+    mismatch = grey_rms / texture.clamp_min(1e-8).sqrt()
+    if fitted_noise:  # the shape of the tracks' covariances and the scale of the pose's residuals
+        scale = torch.where(fit.ok[:, None], fit.sigma_px[:, None], 1.0).to(cov.dtype)
+        cov = noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
     own, shared = _variance(geometry, cov, fit, y)
     own, shared = own * sigma_scale**2, shared * sigma_scale**2
     own = own * _variance_factor(
@@ -130,9 +128,13 @@ def two_view(
     no_share = torch.zeros_like(shared)
     by_pose, by_sensor = shared, no_share
     if sensor_share > 0:
-        by_sensor = (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
+        used = fit.inlier & (samples.depth > 0)
+        relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
+        relative = torch.where(used.any(-1, keepdim=True), masked_median(relative, used), 0.0)
+        by_sensor = (sensor_share * relative * geometry.depth) ** 2
         shared = by_pose + by_sensor
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
+    weak = torch.zeros_like(fit.ok) if min_t_snr is None else ~(fit.t_snr >= min_t_snr)
     limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
         (~tracked, Gate.NO_TRACK),
@@ -140,7 +142,7 @@ def two_view(
         ((fit.code == PoseCode.REFUTED)[:, None].expand_as(tracked), Gate.POSE_REFUTED),
         ((fit.code == PoseCode.MISALIGNED)[:, None].expand_as(tracked), Gate.MISALIGNED),
         (~posed, Gate.NO_POSE),
-        (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
+        (weak[:, None].expand_as(tracked), Gate.NO_BASELINE),
         (behind, Gate.BEHIND),
         (parallax_deg <= (min_parallax_deg if min_parallax_deg is not None else -1.0), Gate.PARALLAX),
         (geometry.residual_px >= (max_residual_px if max_residual_px is not None else torch.inf), Gate.RESIDUAL),
@@ -180,19 +182,6 @@ def _variance(geometry: epipolar.TwoView, cov: Tensor, fit: PoseFit, y: Tensor |
     return epipolar.depth_variance(geometry._replace(J_pose=J), cov, fit.shutter.cov.nan_to_num())
 
 
-def _relative_noise(samples: Samples, fit: PoseFit) -> Tensor:
-    """Median sigma / depth (B, 1) of the near inliers of the pose; 0 where there are none."""
-    used = fit.inlier & (samples.depth > 0)
-    relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
-    return torch.where(used.any(-1, keepdim=True), masked_median(relative, used), 0.0)
-
-
-def _rescaled_covariance(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Tensor:
-    """Covariances with the shape of the tracks' covariances and the scale of the pose's residuals."""
-    scale = torch.where(fit.ok[:, None], fit.sigma_px[:, None], 1.0).to(cov.dtype)
-    return noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
-
-
 def _variance_factor(*terms: tuple[Tensor, float | None]) -> Tensor | float:
     """Factor on a track's variance from error terms and their scales: 1 + Σ (term / scale)²."""
     factor: Tensor | float = 1.0
@@ -205,10 +194,6 @@ def _variance_factor(*terms: tuple[Tensor, float | None]) -> Tensor | float:
 def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:
     """Where ``x`` exceeds the limit or is not a number; nowhere without a limit."""
     return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x <= limit)
-
-
-def _below(x: Tensor, limit: float | None) -> Tensor:
-    return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x >= limit)
 
 
 def _safe_pose(fit: PoseFit) -> Pose:

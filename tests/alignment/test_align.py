@@ -5,7 +5,6 @@ import torch
 
 from dhtorch import align_depth
 from dhtorch.alignment.error_model import estimate_freedom
-from dhtorch.alignment.options import AlignmentOptions
 from dhtorch.alignment.references import collect_references
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.compare import align_study
@@ -260,14 +259,6 @@ def test_a_handful_of_anchors_is_no_answer(left):
     assert (align_depth(truth, some).gate == Gate.NO_POSE).all()
 
 
-def test_near_returns_alone_are_enough():
-    truth, near, far = world()
-    none = far.replace(gate=torch.full_like(far.gate, Gate.NO_BASELINE))
-    found = align_depth(0.8 * truth, [near, none])
-    assert found.keep.all() and error(found, truth) < 0.01
-    assert torch.allclose(found.depth, align_depth(0.8 * truth, near).depth, rtol=1e-6)
-
-
 def test_anchors_that_are_all_wrong_are_no_reason_to_be_sure():
     truth, near, far = world()
     g = torch.Generator().manual_seed(5)
@@ -327,24 +318,6 @@ def test_a_pixel_that_is_not_sure_enough_is_silent():
     found = align_depth(x, [near, far], max_sigma_rel=limit)
     assert torch.equal(found.gate == Gate.UNCERTAIN, rel > limit) and 0.3 < (rel > limit).double().mean() < 0.7
     assert ((found.gate == Gate.UNCERTAIN) | found.keep).all() and found.depth[~found.keep].isnan().all()
-
-
-@pytest.mark.slow
-def test_options_change_what_they_name():
-    """One option of each stage: the references, the fits, the selection and the noise."""
-    truth, near, far = world()
-    x, _ = depth_faults.apply_fault("simulated", truth)
-    plain = align_depth(x, [near, far])
-    for changed in (
-        AlignmentOptions(min_return_error=0.05),
-        AlignmentOptions(field_lengths=(0.5, 0.2)),
-        AlignmentOptions(max_models=1),
-        AlignmentOptions(roughness_window=0.2),
-    ):
-        assert not torch.equal(align_depth(x, [near, far], options=changed).sigma, plain.sigma), changed
-    many = AlignmentOptions(min_references=10_000)
-    assert (align_depth(x, [near, far], options=many).gate == Gate.NO_POSE).all()
-    assert torch.equal(align_depth(x, [near, far], options=AlignmentOptions()).sigma, plain.sigma)
 
 
 @pytest.mark.parametrize("kind", ["scale", "affine", "inverse"])

@@ -130,37 +130,3 @@ def test_far_answers_lean_together_and_near_returns_do_not():
     assert lean.shape == (1, 40, error_model.N_MOTION_ERRORS) and (lean[~far] == 0).all()
     torch.testing.assert_close(lean[far][:, 0], torch.full((20,), 0.05).double())
     assert (lean[far].abs().amax(0) > 0.02).all() and lean.abs().max() <= 3 * 0.05
-
-
-def worth_of_a_scale(scale):
-    """What a model of a scale says that references are worth, and the integral over all scales that it believed possible."""
-    references = points(n=12)
-    noise = 0.05 * torch.randn(1, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    references = references._replace(
-        depth=scale * references.x * noise.exp(), var=torch.full_like(references.var, 0.05**2)
-    )
-    task = AlignmentProblem(
-        references, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), references.x[:, :1]
-    )
-    model = torch.tensor([[list(ERROR_MODELS).index("scale")]])
-    found = error_model.fit_models(task, model, references.used, DEFAULT_ALIGNMENT_OPTIONS.final_steps)
-    problem = error_model._problem(task, model, references.used)
-    spread = problem.noise_variance(found.noise[0]).sqrt()
-    tails = torch.distributions.StudentT(problem.freedom)
-    xi = torch.zeros(1, problem.phi.shape[-1] + 2, dtype=torch.float64)
-    at, told = torch.linspace(-0.5, 4.0, 2001, dtype=torch.float64), []
-    for x in at:
-        xi[0, 0] = x
-        r, _ = problem.residuals(xi)
-        each = tails.log_prob(r / spread) - tails.log_prob(torch.zeros_like(r)) - spread.log()
-        told.append((problem.weight * each).sum() - 0.5 * x.square())
-    whole = torch.stack(told).logsumexp(0) + (at[1] - at[0]).log() - 0.5 * torch.log(torch.tensor(2 * torch.pi))
-    return float(found.evidence), float(whole)
-
-
-def test_evidence_is_an_integral_over_what_was_believed_possible():
-    """Laplace's: off by how much a tail bends, alike wherever the scale lies; far from what was believed it is worth
-    less."""
-    (near, near_whole), (far, far_whole) = (worth_of_a_scale(scale) for scale in (1.1, 3.0))
-    assert near - near_whole == pytest.approx(far - far_whole, abs=0.05) and abs(near - near_whole) < 0.7
-    assert near - far > 0.7

@@ -1,4 +1,4 @@
-"""README's numbers are of scenes on which no constant was chosen."""
+"""No constant or calibration was chosen on the scenes that the README's numbers are of."""
 
 import re
 from pathlib import Path

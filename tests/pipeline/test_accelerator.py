@@ -79,18 +79,6 @@ def test_no_stage_makes_the_host_wait(name):
     assert_alike(there, here)
 
 
-def test_the_pretended_device_records_waits_and_refuses_a_mixture():
-    x = torch.arange(3.0)
-    with PretendDevice() as device:
-        there = OnDevice(x)
-        assert bool((there > 1).any()) and there[there > 1].shape == (1,)
-        there.cpu(), x.to(there.device), x.to(there.device, non_blocking=True), there.new_tensor([1.0])
-        with pytest.raises(RuntimeError, match="one device"):
-            there + x
-    kinds = sorted(kind for kind, _ in device.waits.elements())
-    assert kinds == ["copy to cpu", "copy to meta", "copy to meta", "item", "mask index"]
-
-
 def test_a_constant_is_kept_beside_an_accelerator_and_made_anew_on_the_cpu():
     x = torch.zeros(2, dtype=torch.float64)
     assert torch.equal(checks.constant(x, [[1, 2.5]]), torch.tensor([[1, 2.5]], dtype=torch.float64))

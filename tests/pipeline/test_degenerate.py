@@ -49,47 +49,6 @@ def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):
     assert share["map"] > 0.2 and share["paper"] > 0.5
 
 
-def test_every_broken_promise_is_seen():
-    """Spoil one number after the other in a good answer: the promise about it is reported, for that pair alone."""
-    estimate, trace = alone(2 * len(KINDS)).estimate("paper")
-    assert estimate.keep.any() and trace["fit"].ok.all()
-    assert not any(v.any() for v in degenerate.broken(estimate, trace).values())
-    said = estimate.keep & estimate.keep.cumsum(-1).eq(1)
-    silent = ~estimate.keep & (~estimate.keep).cumsum(-1).eq(1)
-
-    def put(record, name, where, value):
-        return record.replace(**{name: torch.where(where, value, getattr(record, name))})
-
-    spoilt = {
-        "an answer is a depth with a sigma": put(estimate, "sigma", said, 0.0),
-        "the shared part is no more than sigma": put(estimate, "sigma_shared", said, 1e3),
-        "silence is NaN with score 0": put(estimate, "depth", silent, 1.0),
-        "score in [0, 1]": put(estimate, "score", said, torch.nan),
-        "a gate of the table": put(estimate, "gate", silent, 77),
-        "parallax and residual are numbers": put(estimate, "residual_px", silent, torch.inf),
-        "one or two views": put(estimate, "n_views", silent, 0),
-    }
-    for promise, wrong in spoilt.items():
-        assert degenerate.broken(wrong, trace)[promise].all(), promise
-    fit = trace["fit"]
-    T, nothing = fit.T_1_from_0, fit.replace(code=torch.full_like(fit.code, PoseCode.TOO_FEW))
-    poses = {
-        "a code of the table": fit.replace(code=fit.code + 50),
-        "a pose is made of numbers": fit.replace(t_snr=fit.t_snr * torch.nan),
-        "no pose is NaN throughout": nothing,
-        "an inlier is a near point of a pose": nothing,
-        "R is a rotation": fit.replace(T_1_from_0=T.replace(R=-T.R)),
-        "variances are positive": fit.replace(cov=-fit.cov),
-    }
-    for promise, wrong in poses.items():
-        assert degenerate.broken(estimate, {**trace, "fit": wrong})[promise].all(), promise
-    tracks = trace["tracks"]
-    wrong = {**trace, "tracks": tracks.replace(cov=tracks.cov * torch.nan)}
-    assert degenerate.broken(estimate, wrong)["a valid track is a place with a covariance"].all()
-    wrong = {**trace, "samples": trace["samples"].replace(sigma=trace["samples"].sigma * torch.inf)}
-    assert degenerate.broken(estimate, wrong)["the map is a number everywhere"].all()
-
-
 @pytest.mark.parametrize("sky", [1e10, 3e38])
 def test_one_return_of_the_sky_does_not_make_a_line(sky):
     """Renderers write 1e10 where nothing is: a point so far away is a direction, the others are no line for it."""

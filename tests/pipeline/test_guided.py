@@ -2,21 +2,17 @@
 
 import math
 from functools import cache
-from types import SimpleNamespace
 
 import pytest
 import torch
 from support.rooms import room
 
 from dhtorch.codes import Gate, Hole
-from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import se3
 from dhtorch.metrics import errors, holdout
-from dhtorch.pipeline import pair
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Estimate, Pose, Samples, Tracks
-from dhtorch.stages.guided_search import GuidedMatches
+from dhtorch.records import Pose
 from dhtorch.stages.pose_prior import make_prior
 
 HW = (120, 160)
@@ -153,87 +149,14 @@ def test_a_prior_lifts_no_limit_of_a_method_without_a_guide():
     assert GUIDED(seen, other, fit=prior, **strict).keep.any(), "the guide's poses agree with the prior"
 
 
-def test_a_prior_is_confirmed_by_a_pose_that_is_near_it_in_turn_and_translation():
-    T = Pose(torch.eye(3)[None], torch.tensor([[0.1, 0.0, 0.0]]))
-    fit = known_pose_fit(T, 8)
-    about_y = torch.tensor([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
+def test_only_unique_matches_that_correlate_become_tracks():
+    (whole, other), (T,) = orbit(35)
 
-    def agrees(turn=0.0, scale=1.0):
-        return bool(pair._agrees(fit, Pose(se3.exp(turn * about_y).R, scale * T.t)))
+    def coverage(**changes):
+        def guide(*arguments, **options):
+            found = AUTO.guide(*arguments, **options)
+            return found.replace(**{name: torch.full_like(getattr(found, name), x) for name, x in changes.items()})
 
-    assert agrees() and agrees(turn=0.9 * pair.MAX_PRIOR_TURN_RAD) and agrees(scale=0.9)
-    assert not agrees(turn=1.5 * pair.MAX_PRIOR_TURN_RAD) and not agrees(scale=0.5)
+        return measured(GUIDED.replace(guide=guide), whole, other, fit=make_prior(T))[0]["coverage"]
 
-
-def samples_of(n, returns=()):
-    """Textured samples (1, n), those of ``returns`` with a return."""
-    uv, zeros = torch.rand(1, n, 2), torch.zeros(1, n)
-    xyz = torch.full((1, n, 3), torch.nan)
-    xyz[0, list(returns)] = 1.0
-    return Samples(
-        uv=uv, depth=zeros, sigma=zeros, xyz=xyz, confidence=zeros, flag=zeros.int(), trackability=zeros + 1,
-        hole=zeros.int(),
-    )  # fmt: skip
-
-
-def tracks_of(samples):
-    """Tracks of no valid sample, that stay where they are."""
-    zeros, uv = torch.zeros_like(samples.depth), samples.uv
-    eye = torch.eye(2).expand(*zeros.shape, 2, 2)
-    return Tracks(uv_0=uv, uv_1=uv, error=zeros, photometric=zeros, cov=eye, valid=zeros.bool())
-
-
-def test_only_unique_matches_that_correlate_become_tracks(monkeypatch):
-    """Matches of six samples in one view: not unique, at no place, answered already, with a return, and two good ones,
-    of which one correlates too little."""
-    n, samples = 6, samples_of(6, returns=(3,))
-    tracks, uv = tracks_of(samples), samples.uv
-    found = GuidedMatches(
-        uv_1=uv[None] + 1, cov=tracks.cov[None], ncc=torch.full((1, 1, n), 0.9), rms=tracks.error[None],
-        unique=torch.tensor([[k != 0 for k in range(n)]]),
-    )  # fmt: skip
-    found.uv_1[0, 0, 1] = torch.nan
-    found.ncc[0, 0, 4] = 0.5
-    estimate = SimpleNamespace(keep=torch.tensor([[k == 2 for k in range(n)]]))
-    picture = torch.zeros(1, 3, 8, 8)
-    views = pair._Views(
-        GUIDED,
-        SimpleNamespace(image=picture),
-        SimpleNamespace(image=picture[None]),
-        samples,  # type: ignore[arg-type]
-    )
-    monkeypatch.setattr(pair, "_search_matches", lambda *_: found)
-    fit = SimpleNamespace(T_1_from_0=None)
-    tried = pair._answer_matches(views, (tracks, estimate, tracks, fit), lambda new, _: new, lambda _, x: x)
-    assert tried.valid.tolist() == [[False] * 5 + [True]]
-    assert torch.equal(tried.uv_1[0, 5], uv[0, 5] + 1) and torch.equal(tried.uv_1[0, :5], uv[0, :5])
-
-
-def test_of_several_results_that_with_most_answers_without_a_return_is_taken():
-    samples = samples_of(4, returns=(1, 2))
-    fit = known_pose_fit(Pose(torch.eye(3)[None], torch.zeros(1, 3)), 4)
-    results = []
-    for k, kept in enumerate(((0, 1, 2), (0, 1, 3), (0, 3))):
-        estimate = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2)
-        estimate.gate[0, list(kept)] = Gate.ANSWER
-        tracks = tracks_of(samples).replace(error=torch.full((1, 4), float(k)))
-        results.append((tracks, estimate, tracks, fit))
-    tracks, estimate, _, _ = pair._most_answers(samples, results)
-    assert tracks.error.tolist() == [[2.0] * 4], "the last of two with two answers; the first has one"
-    assert estimate.keep.tolist() == [[True, False, False, True]]
-
-
-def test_places_of_matches_move_with_the_picture():
-    frames = room(n_frames=2, hw=HW)
-    reference, other = frames[0], stack([frames[0]])
-    picture = reference.image.float().div(255) if reference.image.dtype == torch.uint8 else reference.image.clone()
-    picture.requires_grad_()
-    uv = torch.tensor([[[40.0, 60.0], [80.0, 50.0], [110.0, 70.0]]])
-    views = pair._Views(GUIDED, reference.replace(image=picture), other, SimpleNamespace(uv=uv))  # type: ignore[arg-type]
-    matches = SimpleNamespace(uv_1=uv[None])
-    places = pair._differentiable_places(views, matches)  # type: ignore[arg-type]
-    assert torch.equal(places, uv[None])
-    (slope,) = torch.autograd.grad(places.sum(), picture)
-    assert slope.isfinite().all() and slope.abs().max() > 1e-3
-    with torch.no_grad():
-        assert not pair._differentiable_places(views, matches).requires_grad  # type: ignore[arg-type]
+    assert coverage(unique=False) < coverage(ncc=0.69) < coverage(ncc=0.7)

@@ -1,24 +1,18 @@
-"""The line of stages with stages that only look: what is handed to whom, who is silenced, and what the map is made of."""
+"""Between the stages: the merged map, samples without texture, precisions, draws, and tracks through lenses."""
 
 import itertools
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
 from dhtorch import extend
-from dhtorch.cli.run import config_dir
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws, upcast_intrinsics
-from dhtorch.pipeline.presets import METHODS
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
-from dhtorch.stages import pose, score, triangulate
-from dhtorch.stages.track import lucas_kanade_affine
 
 HW = (20, 30)
 
@@ -94,96 +88,26 @@ def test_the_map_is_the_sensor_else_the_answer_else_nothing_in_every_field():
     assert len(kinds) == 4 and merged.source.dtype == torch.int32 and torch.equal(merged.uv, samples.uv)
 
 
-# ---------------------------------------------------------------------------------------------------- who gets what
-
-
-class RecordingStages:
-    """Seven stages that answer made-up things and remember what they were given."""
-
-    def __init__(self, n=12, batch=2, gate=None):
-        self.seen, self.n = {}, n
-        self.uv = 2 + rand(n, 2, seed=40) * torch.tensor([25.0, 15.0])
-        self.samples = samples_of(self.uv.expand(batch, n, 2))
-        self.tracks = tracks_of(self.samples.uv)
-        self.fit = known_pose_fit(se3.exp(rand(batch, 6, seed=41)), n)
-        self.estimate = estimate_of(self.samples, gate)
-        answers = {"backproject": self.samples, "classify": self.samples.replace(flag=self.samples.flag + 4)}
-        answers |= {"track": self.tracks, "pose": self.fit, "triangulate": self.estimate, "sample": self.uv}
-        self.functions = {name: self.stage(name, answer) for name, answer in answers.items()}
-        self.functions["score"] = self.stage("score", None)
-        self.functions["verify"] = lambda samples, tracks, fit, camera_0, camera_1: fit
-
-    def stage(self, name, answer):
-        def look(*args, **options):
-            self.seen[name] = args, options
-            return args[0] if answer is None else answer
-
-        return look
-
-
-def test_every_stage_gets_what_those_before_it_found():
-    stages, trace = RecordingStages(), {}
-    lens = torch.tensor([[0.1, -0.05, 0.001, 0.002]])
-    frame_0, frame_1 = frame(lens=lens), frame(seed=5, lens=-lens)
-    frame_1 = frame_1.replace(camera=frame_1.camera.replace(f=1.1 * frame_1.camera.f))
-    estimate = extend(
-        frame_0, frame_1, **stages.functions, n=12, hypotheses=7, seed=3, min_trackability=0.3, trace=trace
-    )
-    (hw, n), options = stages.seen["sample"]
-    assert (hw, n) == (HW, 12) and options == {"device": torch.device("cpu"), "dtype": torch.float64}
-    assert stages.seen["backproject"][0][0].depth is frame_0.depth and stages.seen["backproject"][0][1] is stages.uv
-    assert stages.seen["classify"][0][0].depth is frame_0.depth and stages.seen["classify"][0][1] is stages.samples
-    images = stages.seen["track"][0]
-    assert images[0] is frame_0.image and images[1] is frame_1.image and torch.equal(images[2], stages.samples.uv)
-    classified, usable, camera_0, camera_1, draws = stages.seen["pose"][0]
-    assert (classified.flag == 4).all(), "what classify made of the samples"
-    expected = undistort_tracks(stages.tracks, frame_0.camera, frame_1.camera)
-    for name in ("uv_0", "uv_1", "cov"):
-        assert torch.equal(getattr(usable, name), getattr(expected, name)), name
-    assert torch.equal(usable.valid, stages.tracks.valid & (stages.samples.trackability >= 0.3))
-    for camera, of in ((camera_0, frame_0), (camera_1, frame_1)):
-        assert torch.equal(camera.f, of.camera.f) and camera.distortion is None
-    assert torch.equal(draws, uniform_draws(3, 2, 7)) and draws.dtype == torch.float64
-    args = stages.seen["triangulate"][0]
-    fit = args[2]
-    assert args[0] is classified and args[1] is usable and fit.T_1_from_0 is stages.fit.T_1_from_0
-    assert torch.equal(fit.code, stages.fit.code)
-    assert args[3] is camera_0 and args[4] is camera_1
-    assert stages.seen["score"][0][1:] == (classified, usable, fit)
-    assert trace["tracks"] is stages.tracks and trace["tracks_ideal"] is usable and trace["fit"] is fit
-    assert trace["samples"] is classified and trace["estimate"] is estimate
-
-
-def test_a_given_pose_is_taken_and_stage_five_not_asked():
-    stages, other = RecordingStages(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
-    extend(frame(), frame(), **stages.functions, n=12, fit=other)
-    assert "pose" not in stages.seen and stages.seen["triangulate"][0][2] is other
-
-
-def test_pairs_are_tracked_eight_at_a_time():
-    stages, sizes = RecordingStages(batch=11), []
-    track = lambda image_0, image_1, uv, *, hint: sizes.append((len(image_0), len(image_1))) or tracks_of(uv)  # noqa: E731
-    extend(frame(11), frame(11), **stages.functions | {"track": track})
-    assert sizes == [(8, 8), (3, 3)]
+# ---------------------------------------------------------------------------------------------------- without texture
 
 
 def test_a_lost_sample_without_texture_says_so():
     """NO_TEXTURE takes the place of NO_TRACK where a track was found and only the texture is too weak."""
-    gate = torch.tensor([[Gate.NO_TRACK] * 4 + [Gate.NO_POSE, Gate.ANSWER, Gate.NO_TRACK]], dtype=torch.int32)
-    stages = RecordingStages(n=7, batch=1, gate=gate)
-    valid = torch.tensor([[True, True, False, False, True, True, True]])
+    lost, usable = Gate.NO_TRACK, []
+    gate = torch.tensor([[lost] * 4 + [Gate.NO_POSE, Gate.ANSWER, lost]], dtype=torch.int32)
     texture = torch.tensor([[0.1, 0.3, 0.1, 0.3, 0.1, 0.1, 0.2]]).double()
-    stages.functions["track"] = stages.stage("track", stages.tracks.replace(valid=valid))
-    stages.functions["classify"] = stages.stage("classify", stages.samples.replace(trackability=texture))
-    found = extend(frame(1), frame(1), **stages.functions, min_trackability=0.2).gate[0]
-    lost = Gate.NO_TRACK
+    samples = samples_of(2 + 15 * rand(1, 7, 2, seed=40)).replace(trackability=texture)
+    tracks = tracks_of(samples.uv).replace(valid=torch.tensor([[True, True, False, False, True, True, True]]))
+    fit = known_pose_fit(se3.exp(rand(1, 6, seed=41)), 7)
+    stages = {"sample": lambda *_, **__: samples.uv[0], "backproject": lambda *_: samples, "verify": None}
+    stages |= {"track": lambda *_, hint: tracks, "triangulate": lambda *_: estimate_of(samples, gate)}
+    stages |= {"pose": lambda *a: usable.append(a[1].valid[0].tolist()) or fit, "score": lambda e, *_: e}
+    found = extend(frame(1), frame(1), **stages, classify=lambda *_: samples, min_trackability=0.2).gate[0]
     assert found.tolist() == [Gate.NO_TEXTURE, lost, lost, lost, Gate.NO_POSE, Gate.ANSWER, lost]
-    usable = stages.seen["pose"][0][1].valid[0]
-    assert usable.tolist() == [False, True, False, False, False, False, True], "texture at the limit is enough"
-    faint = stages.samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
-    stages.functions["classify"] = stages.stage("classify", faint)
-    extend(frame(1), frame(1), **stages.functions)
-    assert stages.seen["pose"][0][1].valid[0].tolist() == [True, False, False, False, True, True, True], "1e-5"
+    assert usable[-1] == [False, True, False, False, False, False, True], "texture at the limit is enough"
+    faint = samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
+    extend(frame(1), frame(1), **stages, classify=lambda *_: faint)
+    assert usable[-1] == [True, False, False, False, True, True, True], "1e-5"
 
 
 def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
@@ -196,17 +120,13 @@ def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
     for dtype in (torch.float32, torch.float64):
         plain = frame(1, dtype=dtype)
         assert upcast_intrinsics(plain).camera is plain.camera and upcast_intrinsics(plain).depth_camera is None
-    stages = RecordingStages(batch=1)
-    extend(half, half, **stages.functions)
-    assert stages.seen["sample"][1]["dtype"] == torch.float32
-    assert stages.seen["triangulate"][0][4].f.dtype == torch.float32
 
 
 def test_views_of_another_shape_or_number_are_refused():
     for bad in (frame(1), frame(2).replace(image=frame(2).image[:, 0]), frame(2).replace(image=frame(1).image)):
         for views in ((frame(2), bad), (bad, frame(2))):
             with pytest.raises(ValueError, match="extend"):
-                extend(*views, **RecordingStages().functions)
+                extend(*views, n=12)
     with pytest.raises(ValueError, match="expected"):
         extend(frame(2).replace(depth=frame(2).depth[0]), frame(2))
 
@@ -289,84 +209,3 @@ def test_a_pixel_outside_of_a_lens_model_or_no_number_is_no_longer_valid():
     assert found.cov[0, 5].isnan().all() and found.cov[0, :5].isfinite().all()
     (found.uv_0[0, :2].sum() + found.uv_1[0, :2].sum() + found.cov[0, :2].sum()).backward()
     assert all(x.grad.isfinite().all() for x in leaves)
-
-
-# ---------------------------------------------------------------------------------------------------- methods
-
-
-def told(n=40, noise_px=0.4):
-    """Frames through a long lens, and a track and a pose stage that know everything: points 2 to 60 m away, with noise."""
-    frame_0, frame_1 = frame(1), frame(1, seed=7)
-    rng = np.random.default_rng(0)
-    uv = torch.tensor(rng.uniform([2, 2], [27, 17], (1, n, 2)))
-    depth = torch.tensor(np.exp(rng.uniform(np.log(2), np.log(60), (1, n))))
-    T = se3.exp(torch.tensor([[0.002, 0.003, -0.001, 0.1, 0.02, 0.01]]).double())
-    big = frame_0.camera.replace(f=frame_0.camera.f * 100)
-    frame_0, frame_1 = frame_0.replace(camera=big), frame_1.replace(camera=big)
-    seen = cam.project(big, se3.apply(T, cam.unproject(big, uv, depth)))
-    tracks = tracks_of(uv).replace(valid=torch.ones(1, n, dtype=torch.bool))
-    tracks = tracks.replace(
-        uv_1=seen + noise_px * torch.tensor(rng.normal(size=(1, n, 2))),
-        photometric=torch.tensor(rng.uniform(0, 3, (1, n))),
-    )
-    fit = known_pose_fit(T, n).replace(
-        cov=1e-8 * torch.eye(6).double()[None],
-        inlier=torch.arange(n)[None] % 3 == 0,
-        sigma_px=torch.tensor([0.7]).double(),
-        t_snr=torch.tensor([40.0]).double(),
-    )
-    samples = samples_of(uv)
-    samples = samples.replace(trackability=0.01 + 0.3 * samples.trackability, sigma=0.05 * samples.depth)
-    given = {"sample": lambda *_, **__: uv, "backproject": lambda *_: samples, "classify": lambda *_: samples}
-    return (frame_0, frame_1), given | {"track": lambda *_, hint: tracks, "pose": lambda *_: fit}, fit
-
-
-WRITTEN_OUT = {
-    "min_parallax_deg": None,
-    "max_residual_px": 3.0,
-    "max_sigma_rel": 0.2,
-    "min_t_snr": 30.0,
-    "max_mismatch_px": 10.0,
-    "fitted_noise": True,
-    "isotropic": 0.1,
-    "mismatch_px": 2.0,
-    "residual_px": 0.5,
-    "round_trip_px": 0.4,
-    "sigma_scale": 1.0,
-    "sensor_share": 1.0,
-}
-
-
-def test_every_option_of_the_method_reaches_its_stage():
-    """The same as the line with all options written out; leaving any of the method's own out changes the answer."""
-    frames, given, fit = told()
-
-    def answer(**options):
-        of = lambda *args: triangulate.two_view(*args, **options)  # noqa: E731
-        return extend(*frames, **given, triangulate=of, score=score.confidence_from_error)
-
-    found, expected = METHODS["map"](*frames, **given), answer(**WRITTEN_OUT)
-    assert 5 < int(found.keep.sum()) < 40
-    for name in ("depth", "sigma", "sigma_shared", "score", "gate"):
-        assert torch.equal(getattr(found, name).nan_to_num(), getattr(expected, name).nan_to_num()), name
-    for name in WRITTEN_OUT.keys() - {"min_t_snr", "max_residual_px", "isotropic", "sigma_scale"}:
-        other = answer(**{k: v for k, v in WRITTEN_OUT.items() if k != name})
-        alike = torch.equal(other.sigma.nan_to_num(), found.sigma.nan_to_num()) and torch.equal(other.gate, found.gate)
-        assert not alike, name
-    for weak in (29.9, 30.1):
-        given["pose"] = lambda *_, weak=weak: fit.replace(t_snr=torch.tensor([weak]).double())
-        assert bool(METHODS["map"](*frames, **given).keep.any()) == (weak > 30)
-
-
-def test_the_method_has_the_stages_that_its_configuration_names():
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        configured = instantiate(compose("run", ["method=map"]).method, _convert_="all")
-    method = METHODS["map"]
-    assert METHODS["paper"] is extend and type(method) is type(configured)
-    assert method.pose is pose.map_pose is configured.pose.func
-    assert method.score is score.confidence_from_error is configured.score.func
-    options = configured.triangulate.keywords
-    assert {k: options[k] for k in WRITTEN_OUT} == WRITTEN_OUT, "what the test above asks for"
-    assert method.triangulate.keywords.items() <= WRITTEN_OUT.items()
-    assert method.track.func is lucas_kanade_affine is configured.track.func
-    assert method.track.keywords == {"levels": configured.track.keywords["levels"]} == {"levels": 5}

@@ -3,7 +3,6 @@
 import pickle
 from dataclasses import fields
 from functools import partial
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,9 +17,6 @@ from dhtorch.data.scene import Scene
 from dhtorch.experiments import pair as pairs
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines.opencv import OPENCV
-from dhtorch.extract import plan
-from dhtorch.extract.dataset import RowDataset
-from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import GONE_METHODS, get_method
 from dhtorch.pipeline.spec import iter_networks
@@ -32,7 +28,6 @@ from dhtorch.stages.sample import spiral
 from dhtorch.stages.score import confidence
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
-from dhtorch.transforms import ExtendDepth
 
 N = 512
 
@@ -109,45 +104,6 @@ def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
     assert not alike(direct, other), "two levels of a pyramid see less far than four"
 
 
-def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
-    frame = room[3]
-    sample_of = {"image": torch.cat((room[0].image, frame.image)), "depth": frame.depth[0]}
-    sample_of["intrinsics"] = cam.to_matrix(frame.camera)[0]
-    answers = [ExtendDepth(method=m, depth_unit="m", other_at=0)(sample_of) for m in (PLAIN, USUAL)]
-    for key in ("depth", "gate", "score"):
-        assert torch.equal(*(a[f"dhtorch.{key}"] for a in answers))
-    kinds = {"depth": "float32", "gate": "int32"}
-    columns = {name: SimpleNamespace(kind=kind, shape=(PLAIN.n,)) for name, kind in kinds.items()}
-    rows = [
-        RowDataset([Scene(room)], plan.make_plan([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
-        for m in (PLAIN, USUAL)
-    ]
-    assert all((rows[0][k] == rows[1][k]).all() for k in columns)
-
-
-@pytest.mark.slow
-def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
-    from dhtorch.cli import job  # noqa: PLC0415
-    from dhtorch.experiments import report  # noqa: PLC0415
-    from dhtorch.experiments.exhibits import make_exhibit  # noqa: PLC0415
-    from dhtorch.runtime import results as result_files  # noqa: PLC0415
-
-    shown = make_exhibit(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
-    assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20
-    settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
-    settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
-    settings |= {"pairs": {}, "experiment": {}, "between": None}
-    parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
-    choices = dict.fromkeys(job.SETTINGS_GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
-    ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)
-    assert ended.state == "finished"
-    result = result_files.read_result(tmp_path)
-    (row,) = (r for r in result["rows"] if r["pair"] is None)
-    assert row["method"] == "plain" and row["coverage"] > 0.5
-    assert report.main([str(tmp_path), "--html", str(tmp_path / "page.html")]) == 0
-    assert "plain" in (tmp_path / "page.html").read_text(encoding="utf-8")
-
-
 def test_a_method_is_a_frozen_record_that_travels():
     assert isinstance(PAPER, Method) and dhtorch.extend is PAPER and MAP.views == 1
     with pytest.raises(AttributeError):
@@ -178,13 +134,6 @@ def test_a_pose_from_elsewhere_takes_the_place_of_stage_5(room):
         raise AssertionError("there is a pose")
 
     assert alike(found, USUAL(room[0], room[3], fit=trace["fit"], pose=nobody))
-
-
-def test_the_front_end_looks_in_the_precision_of_the_intrinsics(room):
-    for dtype in (torch.float32, torch.float64):
-        samples = PAPER.replace(n=16).sample_depth(room[0].to(dtype))
-        assert samples.uv.dtype == samples.xyz.dtype == dtype
-        assert torch.equal(samples.uv[0], spiral(room[0].hw, 16, dtype=dtype))
 
 
 def test_options_of_a_call_are_those_of_a_record(room):

@@ -7,6 +7,7 @@ import torch
 from support import textured_box as walls
 
 from dhtorch import PAPER, extend, pytree
+from dhtorch.codes import Gate
 from dhtorch.experiments.baselines import opencv
 from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.stages.fuse import inverse_variance
@@ -19,12 +20,6 @@ PAIR = {"n": 200, "hypotheses": 64}
 
 
 SURE = partial(inverse_variance, max_sigma_rel=None)
-
-
-# --- fusion ----------------------------------------------------------------------------------------------------------
-
-
-# --- the window ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +95,31 @@ def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room)
     chosen = extend_window(reference, more, views=2, trace=trace, **PAIR)
     assert torch.equal(chosen.gate, few.gate) and len(trace["views"]) == 2
     assert torch.equal(chosen.depth.nan_to_num(), few.depth.nan_to_num())
+
+
+def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace(room):
+    reference, others = room
+    searches = []
+
+    def track(image_0, image_1, uv_0, *, hint):
+        searches.append((hint, lucas_kanade(image_0, image_1, uv_0, hint=hint)))
+        return searches[-1][1]
+
+    extend_window(reference, others, track=track, **PAIR)
+    assert searches[0][0].start is None and all(hint.pyramid is searches[0][0].pyramid for hint, _ in searches)
+    for k in (1, 2):
+        last = searches[k - 1][1]
+        ahead = last.uv_0 + (last.uv_1 - last.uv_0) * (k + 1) / k
+        torch.testing.assert_close(searches[k][0].start, torch.where(last.valid[..., None], ahead, last.uv_0))
+    extend_window(reference, others, track=track, chain=False, **PAIR)
+    assert len(searches) == 6 and all(hint.start is None for hint, _ in searches[3:])
+
+
+def test_a_point_that_any_view_tracked_lacks_texture(room):
+    trace = {}
+    gate = extend_window(*room, min_trackability=1e9, trace=trace, **PAIR).gate
+    tracked = torch.stack([view["tracks"].valid for view in trace["views"]]).any(0)
+    assert (gate[tracked] == Gate.NO_TEXTURE).all() and (gate[~tracked] == Gate.NO_TRACK).all() and tracked.any()
 
 
 def test_wrong_shapes_raise(room):

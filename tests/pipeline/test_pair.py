@@ -1,4 +1,4 @@
-"""The whole method: exact scenes, hopeless input, company of other pairs, gradients; its parts alone: test_merge.py."""
+"""The whole method: exact scenes, company of other pairs, gradients; its parts alone: test_merge.py."""
 
 import os
 from functools import partial
@@ -10,7 +10,6 @@ from support import box_scene as box
 from support import textured_box as walls
 
 from dhtorch import data, extend, pytree
-from dhtorch.codes import Flag, Gate, PoseCode
 from dhtorch.experiments.baselines import opencv
 from dhtorch.experiments.baselines.device_pose import device_pose_fit, known_pose_fit
 from dhtorch.geometry import camera as cam
@@ -104,52 +103,6 @@ def test_every_pair_may_have_its_own_seed(views):
 
 
 # ---------------------------------------------------------------------------------------------------- hopeless input
-
-
-def promised_numbers_are_finite(estimate, samples):
-    for name in ("score", "parallax_deg", "residual_px"):
-        assert getattr(estimate, name).isfinite().all(), name
-    assert estimate.depth[estimate.keep].isfinite().all() and estimate.sigma[estimate.keep].isfinite().all()
-    assert samples.depth.isfinite().all() and samples.confidence.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    "what", ["no depth", "nan depth", "black", "white", "one point", "identical", "unrelated", "swapped"]
-)
-def test_hopeless_input_is_silent_with_a_reason(views, what):
-    (frame_0, frame_1), (other, _), _ = views[0]
-    if what == "no depth":
-        frame_0 = frame_0.replace(depth=0 * frame_0.depth)
-    if what == "nan depth":
-        frame_0 = frame_0.replace(depth=torch.nan * frame_0.depth)
-    if what == "one point":
-        depth = torch.zeros_like(frame_0.depth)
-        depth[0, 60, 80] = 1.5
-        frame_0 = frame_0.replace(depth=depth)
-    if what in ("black", "white"):
-        frame_0 = frame_0.replace(image=torch.full_like(frame_0.image, 0 if what == "black" else 255))
-    if what == "identical":
-        frame_1 = frame_0
-    if what == "unrelated":
-        frame_1 = frame_1.replace(
-            image=frame_1.image[..., torch.randperm(HW[1], generator=torch.Generator().manual_seed(0))]
-        )
-    if what == "swapped":
-        frame_0, frame_1 = frame_1, other
-    trace = {}
-    estimate = extend(frame_0, frame_1, n=256, trace=trace)
-    promised_numbers_are_finite(estimate, trace["samples"])
-    if what in ("no depth", "nan depth", "one point"):
-        assert (trace["fit"].code == PoseCode.TOO_FEW).all() and not estimate.keep.any()
-        assert trace["fit"].T_1_from_0.t.isnan().all()
-        assert (
-            (estimate.gate == Gate.NO_POSE) | (estimate.gate == Gate.NO_TRACK) | (estimate.gate == Gate.NO_TEXTURE)
-        ).all()
-    if what in ("black", "white"):
-        bit = Flag.UNDEREXPOSED if what == "black" else Flag.SATURATED
-        assert ((trace["samples"].flag & bit) != 0).all() and not estimate.keep.any()
-    if what == "identical":
-        assert not estimate.keep.any(), "no baseline, no answer"
 
 
 def test_a_pure_rotation_is_not_answered():

@@ -76,11 +76,6 @@ def test_pixels_of_a_map_stand_for_what_they_cover(scene):
     torch.testing.assert_close(camera.c, (reference.camera.c + 0.5) / 2 - 0.5)
 
 
-def test_true_is_no_number():
-    with pytest.raises(ValueError, match=r"dense.planes: found True, expected a whole number"):
-        dense.dense_options({"planes": True})
-
-
 def test_what_the_motion_does_not_know_is_in_sigma(scene):
     reference, asked = scene
     sure, unsure = mapped(scene), mapped((reference, asked._replace(fits=asked.fits.replace(cov=400 * asked.fits.cov))))
@@ -98,18 +93,6 @@ def test_no_depth_is_surer_than_the_sensors_metre(scene):
     assert bool((found.sigma[told] >= 0.0299 * found.depth[told]).all())
 
 
-def test_what_moves_on_its_own_silences_every_pixel(scene):
-    reference, asked = scene
-    gate = torch.where(asked.joined.keep, Gate.CONTRADICTED, asked.joined.gate)
-    found = mapped((reference, asked._replace(joined=asked.joined.replace(gate=gate))))
-    silent = found.source == Source.NONE
-    assert (
-        silent.any()
-        and bool((found.gate[silent] == Gate.CONTRADICTED).all())
-        and not bool((~silent & (found.source == Source.SWEPT)).any())
-    )
-
-
 def test_a_few_returns_refute_no_motion(scene):
     reference, asked = scene
     fits = asked.fits.replace(T_1_from_0=asked.fits.T_1_from_0.replace(t=1.5 * asked.fits.T_1_from_0.t))
@@ -123,12 +106,31 @@ def test_a_few_returns_refute_no_motion(scene):
     assert bool((mapped((reference.replace(depth=few), wrong)).source == Source.SWEPT).any())
 
 
-def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
-    best = surface.sweep_planes
-    monkeypatch.setattr(surface, "sweep_planes", lambda *a: (x := best(*a))._replace(alone=torch.zeros_like(x.alone)))
-    found = mapped(scene)
-    assert not bool((found.source == Source.SWEPT).any())
-    assert bool((found.gate[found.source == Source.NONE] == Gate.UNCERTAIN).any())
+@pytest.mark.parametrize(
+    ("module", "name", "change", "options", "gate"),
+    [
+        (surface, "sweep_planes", lambda x: x._replace(alone=torch.zeros_like(x.alone)), {}, Gate.UNCERTAIN),
+        (plane_sweep, "occlusion_mask", torch.ones_like, {}, Gate.NO_TRACK),
+        (plane_sweep, "fit_windows", lambda x: x._replace(correlation=0 * x.correlation + 0.4), {"min_correlation": 0.0}, None),
+        (plane_sweep, "fit_windows", lambda x: x._replace(correlation=0 * x.correlation + 0.6), {"min_correlation": 0.65}, Gate.NO_TRACK),
+    ],
+)  # fmt: skip
+def test_nothing_is_swept_that_fits_elsewhere_is_hidden_or_hardly_fits(
+    scene, monkeypatch, module, name, change, options, gate
+):
+    found = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *a, **k: change(found(*a, **k)))
+    depth_map = mapped(scene, **options)
+    assert not bool((depth_map.source == Source.SWEPT).any()) and bool((depth_map.source == Source.NONE).any())
+    silent = depth_map.gate[depth_map.source == Source.NONE]
+    assert gate is None or bool((silent == gate).any() if gate == Gate.UNCERTAIN else (silent == gate).all())
+
+
+def test_what_moves_on_its_own_silences_every_pixel(scene):
+    reference, asked = scene
+    gate = torch.where(asked.joined.keep, Gate.CONTRADICTED, asked.joined.gate)
+    found = mapped((reference, asked._replace(joined=asked.joined.replace(gate=gate))))
+    assert set(found.gate[found.source != Source.SENSOR].tolist()) == {int(Gate.CONTRADICTED)}
 
 
 def test_a_rival_is_a_place_that_costs_nearly_as_little(scene, monkeypatch):
@@ -145,27 +147,6 @@ def test_a_rival_is_a_place_that_costs_nearly_as_little(scene, monkeypatch):
         found = surface.sweep_planes(base, source_view, q)
         assert bool((found.alone == alone).all())
         torch.testing.assert_close(found.q, torch.full_like(found.q, 8 / 31), atol=0.5 / 31, rtol=0)
-
-
-def test_how_far_away_is_elsewhere_says_the_view_that_moves_most(scene, monkeypatch):
-    reference, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
-    q = torch.linspace(0, 1, 24)[None]
-    each = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in (0, 1)]
-    reach, rivals = [], plane_sweep.second_best_margin
-    monkeypatch.setattr(
-        plane_sweep, "second_best_margin", lambda some, best, far: reach.append(float(far)) or rivals(some, best, far)
-    )
-    for source_views in ([each[0]], [each[1]], each):
-        surface.sweep_planes(base, source_views, q)
-    assert reach[0] < reach[1] and reach[2] == reach[0]
-
-
-def test_what_a_nearer_surface_hides_is_not_found(scene, monkeypatch):
-    monkeypatch.setattr(plane_sweep, "occlusion_mask", lambda _go, q, _tolerance: torch.ones_like(q, dtype=torch.bool))
-    found = mapped(scene)
-    silent = found.source == Source.NONE
-    assert not bool((found.source == Source.SWEPT).any()) and bool((found.gate[silent] == Gate.NO_TRACK).all())
 
 
 def test_views_that_are_of_no_use_to_one_of_a_batch_say_nothing_of_it(scene):
@@ -186,19 +167,6 @@ def changed(monkeypatch, change):
     """Windows that tell something else: ``change`` of the view and of what a fit finds."""
     fit = plane_sweep.fit_windows
     monkeypatch.setattr(plane_sweep, "fit_windows", lambda base, view, *a, **k: change(view, fit(base, view, *a, **k)))
-
-
-def test_windows_that_hardly_fit_have_no_say(scene, monkeypatch):
-    changed(monkeypatch, lambda _view, f: f._replace(correlation=0 * f.correlation + 0.4))
-    assert not bool((mapped(scene, min_correlation=0.0).source == Source.SWEPT).any())
-
-
-def test_pixels_below_the_least_correlation_are_untracked(scene, monkeypatch):
-    changed(monkeypatch, lambda _view, f: f._replace(correlation=0 * f.correlation + 0.6))
-    below, above = mapped(scene, min_correlation=0.65), mapped(scene, min_correlation=0.55)
-    assert int((above.source == Source.SWEPT).sum()) > 100
-    assert bool((below.gate[below.source == Source.NONE] == Gate.NO_TRACK).all())
-    assert not bool((below.source == Source.SWEPT).any())
 
 
 def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):

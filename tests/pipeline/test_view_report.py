@@ -19,7 +19,6 @@ from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view
 from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.pytree import stack
 from dhtorch.records import ViewSelection
-from dhtorch.runtime import results as result_files
 from dhtorch.synthetic import SyntheticRoom
 
 N = 256
@@ -152,11 +151,6 @@ def test_a_map_knows_all_views_and_links_them(room):
     assert one.picked is None and [*one.links] == [2] and one.pair == (0, 2)
 
 
-def test_steps_of_two_widths_join_what_was_chosen():
-    links = maps.linking_pairs([(0, 4), (3, 1), (2, 0), (1, 4), (4, 2)], chosen=True)
-    assert set(links) == {(0, 1), (1, 2), (2, 3), (3, 4)}, "the median width 2 is there but for (0, 2), (1, 3), (2, 4)"
-
-
 @pytest.mark.parametrize(
     ("words", "choice"),
     [
@@ -170,40 +164,3 @@ def test_steps_of_two_widths_join_what_was_chosen():
 )
 def test_an_option_of_one_choice_alone_chooses_it(words, choice):
     assert run._add_implied_choice(words) == [*words, *choice]
-
-
-@pytest.mark.slow
-def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    tiny = [
-        "data.hw=[120,160]",
-        "data.n_frames=3",
-        "data.supersample=1",
-        "data.step_m=0.04",
-        "method.n=256",
-        "holdout=none",
-    ]
-    assert run.main(["-v", *tiny, "pairs.stride=2", "figures=false", "output=job"]) == 0, capsys.readouterr().err
-    said = capsys.readouterr().err
-    assert said.count("dhtorch.pipeline.view_report: frame ") == 2 and "chosen of 2" in said
-    result = result_files.read_result(tmp_path / "job")
-    assert [r["pair"][0] for r in result["rows"] if r["pair"]] == [0, 2]
-    assert (
-        run.main(
-            [
-                "integrate",
-                *tiny[:-1],
-                "dense=false",
-                "pairs.stride=1",
-                "poses=anchored",
-                "voxel=0.1",
-                "mesh=false",
-                "output=map",
-            ]
-        )
-        == 0
-    )
-    rows = result_files.read_result(tmp_path / "map")["rows"]
-    assert [r["pair"][0] for r in rows if r["pair"]] == [0, 1, 2] and all(r["views"] for r in rows if r["pair"])
-    scene = next(r for r in rows if r["pair"] is None)
-    assert scene["n_frames"] + scene["n_unplaced"] == 3, "all frames were asked"

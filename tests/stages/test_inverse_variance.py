@@ -1,4 +1,4 @@
-"""Fusion by inverse variance and choice of key views, against loops over points; the window with stub stages."""
+"""Fusion by inverse variance and choice of key views, against loops over points."""
 
 import itertools
 import math
@@ -6,22 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from support.view_estimates import make_estimates, rand, random_estimates
+from support.view_estimates import make_estimates, random_estimates
 
-from dhtorch import PAPER
 from dhtorch.codes import Gate
-from dhtorch.experiments.baselines.device_pose import known_pose_fit
-from dhtorch.geometry import se3
-from dhtorch.geometry.pyramid import build_pyramid
-from dhtorch.pipeline.pair import uniform_draws
 from dhtorch.pipeline.view_selection import rank_views
-from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, Frame, Samples, TrackHint, Tracks
 from dhtorch.stages.fuse import inverse_variance
 
-extend_window = PAPER.replace(views=5)
-
-HW = (64, 80)
 FIELDS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
 
 
@@ -202,167 +192,3 @@ def test_answers_without_a_sigma_add_nothing():
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
     mute = views.replace(gate=torch.full_like(views.gate, Gate.NO_TRACK))
     assert rank_views(mute, 2).index.T.tolist() == [[1, 2]], "the wider of equals"
-
-
-# ---------------------------------------------------------------------------------------------------- the window
-
-
-def frame(batch=2, seed=0):
-    camera = Camera(torch.tensor([[70.0, 72.0]]), torch.tensor([[40.0, 30.0]])).map(lambda x: x.expand(batch, -1))
-    return Frame(rand(batch, 1, *HW, seed=seed).float(), 1 + rand(batch, *HW, seed=seed).float(), camera)
-
-
-class RecordingStages:
-    """Stages that record their arguments; view k of the window is identified by its image."""
-
-    def __init__(self, V=3, n=8):
-        self.reference, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
-        self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
-        self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
-        self.answers = random_estimates(V=V, N=n, unanswered=0.2, spread=0.2).to(torch.float32)
-        self.fits = [known_pose_fit(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
-
-    def number(self, image):
-        return next(k for k in range(len(self.others.image)) if torch.equal(self.others.image[k], image))
-
-    def tracks(self, k, uv):
-        zero = uv[..., 0] * 0
-        moved = uv + rand(*uv.shape, seed=60 + k, low=-3, high=3).float()
-        cov = torch.eye(2).expand(*uv.shape, 2)
-        return Tracks(uv, moved, zero, zero, cov, rand(*uv.shape[:2], seed=70 + k) < 0.7)
-
-    def samples(self):
-        one = torch.ones(2, self.n)
-        return Samples(self.uv, one, one, one[..., None].expand(2, self.n, 3), one, one.int(), one, one.int())
-
-    def stages(self):
-        """Stages and options of a method."""
-
-        def track(image_0, image_1, uv, *, hint):
-            k = self.number(image_1)
-            self.asked["track"].append((k, image_0, uv, hint))
-            return self.tracks(k, uv)
-
-        def pose(samples, tracks, camera_0, camera_1, draws):
-            self.asked["pose"].append((samples, tracks, draws))
-            return collate(self.fits)
-
-        def triangulate(samples, tracks, fit, camera_0, camera_1):
-            self.asked["triangulate"].append((samples, fit))
-            step = self.n // samples.uv.shape[1]
-            return self.answers.map(lambda x: x.flatten(0, 1)[:, ::step])
-
-        def score(estimate, samples, tracks, fit):
-            self.calls.append(("score", estimate, samples, tracks, fit))
-            return estimate.replace(score=0.5 * estimate.score)
-
-        def sample(hw, n, **options):
-            self.calls.append(("sample", hw, n, options))
-            return self.uv
-
-        def backproject(frame, uv):
-            self.calls.append(("backproject", frame, uv))
-            return self.samples()
-
-        def classify(frame, samples):
-            self.calls.append(("classify", frame, samples))
-            return samples.replace(hole=samples.hole + 2)
-
-        names = {"sample": sample, "backproject": backproject, "classify": classify, "track": track, "pose": pose}
-        return names | {"triangulate": triangulate, "score": score, "n": self.n, "hypotheses": 5}
-
-
-def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
-    stages, trace = RecordingStages(), {}
-    found = extend_window(stages.reference, stages.others, **stages.stages(), seed=4, trace=trace)
-    names = [call[0] for call in stages.calls]
-    assert names == ["sample", "backproject", "classify", "score"]
-    assert stages.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
-    assert stages.calls[1][1].image is stages.reference.image and stages.calls[2][1].image is stages.reference.image
-    assert [k for k, *_ in stages.asked["track"]] == [0, 1, 2]
-    ((samples, tracks, draws),) = stages.asked["pose"]
-    assert (samples.hole == 3).all(), "what classify made of the samples"
-    assert torch.equal(tracks.uv_1, torch.cat([stages.tracks(k, stages.uv).uv_1 for k in range(3)]))
-    assert torch.equal(draws, uniform_draws(4, 2, 5).float().repeat(3, 1, 1)), "the same draws for all views"
-    ((samples, fit),) = stages.asked["triangulate"]
-    assert torch.equal(fit.T_1_from_0.t, collate(stages.fits).T_1_from_0.t)
-    fused = inverse_variance(stages.answers)
-    _, estimate, samples, tracks, fit = stages.calls[3]
-    for name in (*FIELDS, "gate"):
-        assert torch.equal(getattr(estimate, name).nan_to_num(), getattr(fused, name).nan_to_num()), name
-    assert (samples.hole == 3).all() and torch.equal(fit.T_1_from_0.t, stages.fits[2].T_1_from_0.t)
-    assert torch.equal(tracks.uv_1, stages.tracks(2, stages.uv).uv_1)
-    assert torch.equal(found.score, 0.5 * fused.score)
-    assert trace["estimate"] is found and trace["fit"] is fit and len(trace["views"]) == 3
-    for t, expected in zip(trace["views"], stages.fits, strict=True):
-        assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
-
-
-def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
-    stages = RecordingStages(V=4)
-    extend_window(stages.reference, stages.others, **stages.stages())
-    starts = [hint.start for *_, hint in stages.asked["track"]]
-    assert starts[0] is None
-    for k in (1, 2, 3):
-        last = stages.tracks(k - 1, stages.uv)
-        for b, i in itertools.product(range(2), range(8)):
-            ahead = last.uv_0[b, i] + (last.uv_1[b, i] - last.uv_0[b, i]) * (k + 1) / k
-            expected = ahead if last.valid[b, i] else last.uv_0[b, i]
-            torch.testing.assert_close(starts[k][b, i], expected)
-    assert not last.valid.all() and last.valid.any()
-    alone = RecordingStages(V=4)
-    extend_window(alone.reference, alone.others, **alone.stages(), chain=False)
-    assert all(hint.start is None for *_, hint in alone.asked["track"])
-
-
-def test_the_pyramid_of_the_reference_is_built_once_for_all_views():
-    stages = RecordingStages()
-    extend_window(stages.reference, stages.others, **stages.stages(), hint=TrackHint(levels=3))
-    first, *others = (hint for *_, hint in stages.asked["track"])
-    assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
-    made, expected = first.pyramid(2, 7), build_pyramid(stages.reference.image, 2, 7)
-    assert first.pyramid(2, 7) is made and first.pyramid(1, 7) is not made
-    leaves = [torch.utils._pytree.tree_leaves(x) for x in (made, expected)]
-    assert len(leaves[0]) == len(leaves[1]) > 2
-    assert all(torch.equal(x, y) for x, y in zip(*leaves, strict=True) if isinstance(x, torch.Tensor))
-    part = first.pyramid[1:2]
-    assert part is first.pyramid[1:2] and torch.equal(part(1, 7).levels[0], expected.levels[0][1:2])
-
-
-def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
-    """They are chosen by few of the samples: each reference view has its own choice."""
-    n = 512
-    stages = RecordingStages(V=5, n=n)
-    fits = stack(stages.fits)
-    known = rank_views(stages.answers[:, :, ::2], 2).index
-    assert not torch.equal(known[:, 0], known[:, 1]), "the two reference views choose otherwise"
-    options = stages.stages() | {"track": lambda image_0, image_1, uv, hint: stages.tracks(0, uv)}
-    asked = []
-
-    def triangulate(samples, tracks, fit, camera_0, camera_1):
-        asked.append((samples.uv, fit))
-        probes = samples.uv.shape[1] == n // 2
-        return (stages.answers[:, :, ::2] if probes else stages.answers[:2]).map(lambda x: x.flatten(0, 1))
-
-    trace = {}
-    options |= {"triangulate": triangulate, "views": 2, "fit": fits, "trace": trace}
-    extend_window(stages.reference, stages.others, **options)
-    (probes, first), (uv, second) = asked
-    assert probes.shape == (10, n // 2, 2) and uv.shape == (4, n, 2), "256 samples, every second"
-    assert torch.equal(probes[:2], stages.uv[:, ::2]) and len(trace["views"]) == 2
-    assert torch.equal(first.T_1_from_0.t, fits.T_1_from_0.t.flatten(0, 1))
-    for k in range(2):
-        for b in range(2):
-            assert torch.equal(second.T_1_from_0.t[2 * k + b], fits[int(known[k, b])].T_1_from_0.t[b])
-    assert "pose" not in [c[0] for c in stages.calls] and not stages.asked["pose"]
-
-
-def test_the_texture_of_a_sample_is_measured_in_every_view():
-    stages = RecordingStages()
-    gate = torch.full_like(stages.answers.gate, Gate.NO_TRACK)
-    stages.answers = stages.answers.replace(gate=gate)
-    for limit, reason in ((1.0, Gate.NO_TRACK), (1.01, Gate.NO_TEXTURE)):
-        stages.asked["track"].clear()
-        found = extend_window(stages.reference, stages.others, **stages.stages(), min_trackability=limit)
-        tracked = torch.stack([stages.tracks(k, stages.uv).valid for k in range(3)]).any(0)
-        assert (found.gate[tracked] == reason).all() and (found.gate[~tracked] == Gate.NO_TRACK).all()

@@ -1,7 +1,5 @@
 """The method on kornia: which of its functions run, exact gradients, and the independent implementation beside PAPER."""
 
-import sys
-
 import pytest
 import torch
 from support.contract_inputs import shifted, tracked
@@ -49,51 +47,6 @@ def both(pair):
 
 
 # ------------------------------------------------------------------------------------------------ what runs
-
-
-def kornia_calls(fn):
-    """Names of kornia's functions, without those of its core, that run during ``fn()``."""
-    names = set()
-
-    def note(frame, event, _):
-        module = frame.f_globals.get("__name__", "")
-        if event == "call" and module.startswith(("kornia.geometry.", "kornia.feature.", "kornia.filters.")):
-            names.add(f"{module.split('.')[1]}.{frame.f_code.co_name}")
-
-    before = sys.getprofile()
-    sys.setprofile(note)
-    try:
-        fn()
-    finally:
-        sys.setprofile(before)
-    return names
-
-
-def test_each_of_the_five_stages_with_geometry_runs_on_kornia(pair, both):
-    trace = both[1]
-    samples, tracks, fit = trace["samples"], trace["tracks"], trace["fit"]
-    cameras = pair[0].camera, pair[1].camera
-    runs = {
-        "backproject": lambda: KORNIA.backproject(pair[0], samples.uv),
-        "classify": lambda: KORNIA.classify(pair[0], samples),
-        "track": lambda: KORNIA.track(pair[0].image, pair[1].image, samples.uv),
-        "pose": lambda: KORNIA.pose(samples, tracks, *cameras, uniform_draws(0, 1, 50).float()),
-        "triangulate": lambda: KORNIA.triangulate(samples, tracks, fit, *cameras),
-    }
-    expected = {
-        "backproject": {"geometry.unproject_points", "geometry.remap"},
-        "classify": {"feature.gftt_response", "geometry.remap"},
-        "track": {"geometry.build_pyramid", "filters.spatial_gradient", "geometry.remap"},
-        "pose": {"geometry.project_points", "geometry.dx_project_points_z1", "geometry.projection_from_KRt"},
-        "triangulate": {"geometry.triangulate_points", "geometry.fundamental_from_projections"},
-    }
-    expected["pose"] |= {"geometry.exp", "geometry._mul_se3", "geometry.unproject_points"}
-    expected["triangulate"] |= {"geometry.get_closest_point_on_epipolar_line"}
-    expected["triangulate"] |= {"geometry.left_to_right_epipolar_distance"}
-    calls = {name: kornia_calls(run) for name, run in runs.items()}
-    assert len(calls) == 5
-    assert {name: expected[name] - calls[name] for name in calls if not expected[name] <= calls[name]} == {}
-    assert kornia_calls(lambda: samples.uv + 1) == set(), "the profile sees only what runs"
 
 
 # ------------------------------------------------------------------------------------------------ beside PAPER
@@ -261,21 +214,6 @@ def test_gradients_of_the_triangulation_are_exact():
 
     inputs = (tracks.uv_0, tracks.uv_1, camera_0.f, camera_1.f, camera_1.c, T.R, T.t, tracks.cov, cov_pose)
     assert gradcheck(estimate, [x.clone().requires_grad_() for x in inputs], atol=1e-5, fast_mode=True)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_gradients_through_a_whole_pair_are_finite(dtype):
-    frames = views(dtype)
-    inputs = [frames[0].image, frames[1].image, frames[0].depth, frames[0].camera.f, frames[1].camera.f]
-    inputs = [x.clone().requires_grad_() for x in inputs]
-    reference = frames[0].replace(image=inputs[0], depth=inputs[2], camera=frames[0].camera.replace(f=inputs[3]))
-    source = frames[1].replace(image=inputs[1], camera=frames[1].camera.replace(f=inputs[4]))
-    estimate = KORNIA(reference, source, n=N)
-    keep = estimate.keep
-    assert estimate.depth.dtype == dtype and keep.float().mean() > 0.4
-    loss = sum(getattr(estimate, name)[keep].sum() for name in ("depth", "sigma", "score"))
-    for gradient in torch.autograd.grad(loss, inputs):
-        assert gradient.isfinite().all() and (gradient != 0).any()
 
 
 # ------------------------------------------------------------------------------------------------ rare inputs

@@ -1,12 +1,10 @@
 """``map_pose``: accuracy with far tracks, covariance, which tracks and shutter rates are accepted, gradients."""
 
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from support import dense_reprojection as dense
 from support.pose_problems import map_pose_inputs
 
@@ -352,16 +350,6 @@ def test_gradients_stay_finite_whatever_the_input():
     for x in leaves:
         assert x.grad.isfinite().all()
     assert not fit.cov.requires_grad and (leaves[1].grad[0] != 0).any()
-
-
-def test_options_have_one_default():
-    options, conf = asdict(map_estimate.FitOptions()), Path(__file__).parents[2] / "conf" / "method"
-    written = yaml.safe_load((conf / "map.yaml").read_text())["pose"]
-    defaults = {k: v for k, v in map_pose.__kwdefaults__.items() if k != "start"}
-    assert defaults == options | {k: defaults[k] for k in ("isotropic", "threshold_px")}
-    assert defaults == {k: v for k, v in written.items() if k[0] != "_" and k != "start"}
-    for start in (written["start"], yaml.safe_load((conf / "paper.yaml").read_text())["pose"]):
-        assert pnp_ransac.__kwdefaults__ == {k: v for k, v in start.items() if k[0] != "_"}
 
 
 @pytest.mark.parametrize("seed", range(3))

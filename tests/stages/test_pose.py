@@ -256,44 +256,41 @@ def test_many_points_are_thinned_for_the_search_only():
 # -------------------------------------------------------------------------------------------------- refusals
 
 
-def refused(fit, code):
-    assert fit.code.tolist() == code
-    assert not fit.ok.any() and not fit.inlier.any()
-    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.rms_px, fit.sigma_px, fit.t_snr):
-        assert x.isnan().all()
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 7])
-def test_too_few_points(n):
-    args, _ = pairs(2, n)
-    fit = pnp_ransac(*args)
-    refused(fit, [PoseCode.TOO_FEW] * 2)
-    assert fit.inlier.shape == (2, n)
-
-
-def test_too_few_inliers():
-    args, _ = pairs(3, 60, outliers=1.0)
-    fit = pnp_ransac(*args)
-    refused(fit, [PoseCode.TOO_FEW] * 3)
-    assert (fit.n_inlier < 8).all()
-
-
-def test_lines_and_single_points_are_degenerate():
-    args, T = pairs(3, 30)
-    samples, _, _, camera_1, _ = args
+def on_line(args, T, noise, dtype):
+    """Points on a line, one point many times, and points anywhere."""
     along = torch.linspace(-1, 1, 30, dtype=torch.float64)
     line = torch.stack((along, 0.5 * along, 2 + 0.3 * along), -1)
-    point = torch.tensor([0.2, 0.1, 1.5], dtype=torch.float64).expand(30, 3)
-    xyz = torch.stack((line, point, samples.xyz[2]))
+    xyz = torch.stack((line, torch.tensor([0.2, 0.1, 1.5], dtype=torch.float64).expand(30, 3), args[0].xyz[2]))
     Y = se3.apply(T, xyz)
-    uv_1 = Y[..., :2] / Y[..., 2:] * camera_1.f[:, None] + camera_1.c[:, None]
-    noisy = uv_1 + 0.5 * torch.randn(uv_1.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    for pixels in (uv_1, noisy):
-        for dtype in (torch.float32, torch.float64):
-            moved = tuple(x.to(dtype) for x in with_points(args, xyz=xyz, uv_1=pixels)[:4])
-            fit = pnp_ransac(*moved, args[4])
-            assert fit.code.tolist() == [PoseCode.DEGENERATE, PoseCode.DEGENERATE, PoseCode.OK]
-            refused(fit[:2], [PoseCode.DEGENERATE] * 2)
+    uv_1 = Y[..., :2] / Y[..., 2:] * args[3].f[:, None] + args[3].c[:, None]
+    uv_1 = uv_1 + noise * torch.randn(uv_1.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return *(x.to(dtype) for x in with_points(args, xyz=xyz, uv_1=uv_1)[:4]), args[4]
+
+
+FEW, LINE = [PoseCode.TOO_FEW] * 3, [PoseCode.DEGENERATE, PoseCode.DEGENERATE, PoseCode.OK]
+BROKEN = torch.tensor([[torch.nan, torch.nan], [0.0, 0.0], [500.0, 500.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("made", "change", "expected"),
+    [
+        *((pairs(3, n), lambda args, T: args, FEW) for n in (0, 1, 2, 3, 7)),
+        (pairs(3, 60, outliers=1.0), lambda args, T: args, FEW),
+        *(
+            (pairs(3, 30), lambda args, T, x=x, d=d: on_line(args, T, x, d), LINE)
+            for x in (0.0, 0.5)
+            for d in (torch.float32, torch.float64)
+        ),
+        (pairs(3, 30), lambda args, T: with_points(args, camera_1=args[3].replace(f=BROKEN)), None),
+    ],
+)
+def test_what_has_no_pose_is_refused(made, change, expected):
+    fit = pnp_ransac(*change(*made))
+    lost = fit.code != PoseCode.OK
+    assert lost[:2].all() and (expected is None or fit.code.tolist() == expected)
+    assert torch.equal(fit.ok, ~lost) and not fit.inlier[lost].any() and (fit.n_inlier[fit.code == FEW[0]] < 8).all()
+    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.rms_px, fit.sigma_px, fit.t_snr):
+        assert x[lost].isnan().all() and x[~lost].isfinite().all()
 
 
 def test_points_behind_the_camera_are_no_inliers():
@@ -357,15 +354,6 @@ def test_values_that_cannot_be_used_do_not_matter():
     padded = pnp_ransac(*wide)
     torch.testing.assert_close(padded.T_1_from_0.t[0], fit.T_1_from_0.t[0])
     assert torch.equal(padded.inlier[0, :50], fit.inlier[0]) and not padded.inlier[0, 50:].any()
-
-
-def test_hopeless_intrinsics_are_flagged():
-    args, _ = pairs(3, 30)
-    f = args[3].f.clone()
-    f[0], f[1] = torch.nan, 0.0
-    fit = pnp_ransac(*with_points(args, camera_1=args[3].replace(f=f)))
-    assert (fit.code[:2] != PoseCode.OK).all() and fit.code[2] == PoseCode.OK
-    assert fit.T_1_from_0.R[:2].isnan().all() and fit.T_1_from_0.R[2].isfinite().all()
 
 
 # ------------------------------------------------------------------------------------------ company, gradients

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from support.textures import levels
 
 from dhtorch.geometry.lucas_kanade import CELL_LEVEL
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
@@ -53,19 +52,6 @@ def test_known_shift(shift):
     assert tracks.error.median() < 1e-4
 
 
-def test_many_maps_lead_where_steps_on_pixels_do():
-    src, dst = scene(1, 90, 90), scene(1, 90, 90, (4.7, -3.2))
-    uv = points(1, 12, 90, 90, margin=25)
-    options = {"levels": 1, "iterations": 60, "epsilon_px": 0.0, "max_round_trip_px": 1e9}
-    found = lucas_kanade(src, dst, uv, **options).uv_1
-    level_0, level_1 = (levels(image[0], 1, 21)[0] for image in (src, dst))
-    for n, x in enumerate(uv[0].numpy()):
-        T, g, d = level_0.window(0, x, 21), np.stack([level_0.window(k, x, 21) for k in (1, 2)]), np.zeros(2)
-        for _ in range(60):
-            d = d - np.linalg.solve(g @ g.T, g @ (level_1.window(0, x + d, 21) - T))
-        assert np.abs(found[0, n].numpy() - x - d).max() < 1e-9
-
-
 @pytest.mark.parametrize(
     ("normalise", "change"),
     [("bias", "none"), ("bias", "bias"), ("gain_bias", "none"), ("gain_bias", "bias"), ("gain_bias", "gain_bias")],
@@ -100,20 +86,6 @@ def test_covariance_is_that_of_the_errors():
     assert abs(tracks.photometric.median().item() / noise - 1) < 0.1
 
 
-def test_covariance_is_finite_symmetric_and_positive_everywhere():
-    u = torch.arange(120.0).expand(1, 1, 90, 120)
-    edge = torch.sin(u / 4) * 0.4 + 0.5  # texture along x only
-    half = torch.cat([edge[..., :60], torch.full((1, 1, 90, 60), 0.5)], -1)
-    uv = points(1, 200, 90, 120, dtype=torch.float32)
-    cov = lucas_kanade(half, half, uv).cov[0]
-    assert cov.isfinite().all() and torch.equal(cov, cov.mT)
-    assert (torch.linalg.eigvalsh(cov.double()) > 0).all()
-    flat = uv[0, :, 0] > 75
-    assert cov[flat].diagonal(dim1=-2, dim2=-1).min() > 100  # nothing known: a standard deviation of at least 10 px
-    along_y = cov[uv[0, :, 0] < 45]
-    assert (along_y[:, 1, 1] > 1e4 * along_y[:, 0, 0]).all()
-
-
 # --- what cannot be found --------------------------------------------------------------------------------------------
 
 
@@ -129,13 +101,6 @@ def test_points_that_leave_lie_outside_or_are_no_numbers_are_not_valid():
     assert torch.equal(tracks.uv_1[0, 1:3], uv[0, 1:3]) and all(getattr(tracks, f).isfinite().all() for f in FIELDS)
     tracks.uv_1.sum().backward()
     assert all(x.grad.isfinite().all() for x in leaves)
-
-
-def test_lost_round_trips_are_not_valid():
-    H, W = 100, 120
-    tracks = lucas_kanade(scene(1, H, W), scene(1, H, W, seed=5), points(1, 300, H, W), max_round_trip_px=0.5)
-    assert tracks.valid.float().mean() < 0.2
-    assert (tracks.error[tracks.valid] < 0.5).all()
 
 
 @pytest.mark.parametrize("normalise", ["none", "bias", "gain_bias"])
@@ -173,27 +138,6 @@ def test_wrong_options_raise(call):
 
 
 # --- options ---------------------------------------------------------------------------------------------------------
-
-
-def test_cached_pyramid_initial_positions_sizes_and_dtypes():
-    H, W, shift = 120, 150, (30.0, 4.0)
-    src, dst = scene(1, H, W), scene(1, H, W, shift)
-    uv = points(1, 100, H, W, margin=40)
-    truth = uv + torch.tensor(shift)
-    plain = lucas_kanade(src, dst, uv, levels=1)
-    assert (plain.uv_1 - truth).norm(dim=-1).median() > 5  # too far for one level
-    started = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=truth + 1.0))
-    assert (started.uv_1 - truth).norm(dim=-1).median() < 0.02 and started.valid.float().mean() > 0.97
-    nowhere = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=torch.full_like(uv, float("nan"))))
-    cached = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(pyramid=PyramidCache(src)))
-    narrow = lucas_kanade(src[..., :-7], dst[..., :-3, :], uv, levels=1, hint=TrackHint(start=truth))
-    assert all(torch.equal(getattr(nowhere, f), getattr(plain, f)) for f in FIELDS)
-    assert all(torch.equal(getattr(cached, f), getattr(plain, f)) for f in FIELDS)
-    assert (narrow.uv_1 - truth)[narrow.valid].norm(dim=-1).median() < 0.02
-    single = lucas_kanade(src.float(), dst.float(), uv.float())
-    double = lucas_kanade(src, dst, uv)
-    assert single.uv_1.dtype == torch.float32 and double.uv_1.dtype == torch.float64
-    assert (single.uv_1 - double.uv_1)[double.valid].abs().max() < 2e-3
 
 
 def test_colour_and_bytes_are_grey_images_of_opencv():
@@ -251,19 +195,6 @@ def test_gradient_is_that_of_the_tracked_position():
     assert (to_uv[..., 0] - 1).abs().median() < 0.05 and to_uv[..., 1].abs().median() < 0.05
     drift = scene(1, H, W, (1.41, 0.8)) - dst
     assert abs((to_J * drift).sum().item() / (20 * 0.01) - 1) < 0.05
-
-
-def test_refined_and_searched_positions_agree():
-    src, dst = scene(1, 90, 110, dtype=torch.float32), scene(1, 90, 110, (3.4, -1.2), dtype=torch.float32)
-    uv = points(1, 200, 90, 110, dtype=torch.float32)
-    plain, leaf = lucas_kanade(src, dst, uv), src.clone().requires_grad_()
-    refined = lucas_kanade(leaf, dst, uv)
-    assert all(torch.equal(getattr(plain, f), getattr(refined, f)) for f in FIELDS if f != "uv_1")
-    assert torch.equal(plain.uv_1[~plain.valid], refined.uv_1[~plain.valid])
-    distance = (plain.uv_1 - refined.uv_1).norm(dim=-1)[plain.valid]
-    assert 0 < distance.median() < 0.005 and distance.max() < 0.05
-    with torch.no_grad():
-        assert torch.equal(lucas_kanade(leaf, dst, uv).uv_1, plain.uv_1)
 
 
 # --- real images -----------------------------------------------------------------------------------------------------

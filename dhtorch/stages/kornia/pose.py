@@ -17,9 +17,6 @@ from dhtorch.geometry.camera import to_matrix
 from dhtorch.geometry.p3p import p3p
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 
-#: Limits the points that hypotheses are scored on, a count; more are thinned evenly. Source: ``PAPER``.
-MAX_SCORED_POINTS = 256
-
 
 @torch.inference_mode(False)  # it differentiates inside
 def pnp_ransac_kornia(
@@ -95,7 +92,8 @@ def _search(xyz: Tensor, uv: Tensor, usable: Tensor, K: Tensor, draws: Tensor, l
     index = order.gather(1, triples.flatten(1).clamp(max=order.shape[1] - 1))[..., None].expand(-1, -1, 3)
     rays = kg.camera.unproject_points(uv, torch.ones_like(uv[..., :1]), K)
     R, t, valid = (x.flatten(1, 2) for x in p3p(*(x.gather(1, index).unflatten(1, (-1, 3)) for x in (rays, xyz))))
-    slots = (torch.arange(MAX_SCORED_POINTS, device=n.device) + 0.5) / MAX_SCORED_POINTS * count[:, None]
+    # As in ``PAPER``, more points are thinned evenly.
+    slots = (torch.arange(256, device=n.device) + 0.5) / 256 * count[:, None]
     scored = order.gather(1, slots.long())[..., None]
     points = kg.convert_points_to_homogeneous(xyz.gather(1, scored.expand(-1, -1, 3)))
     projected = points[:, None] @ kg.epipolar.projection_from_KRt(K[:, None].expand_as(R), R, t[..., None]).mT
