@@ -94,7 +94,7 @@ def with_camera(f, c, by=lambda x: x):
 PLANTED = {
     **{
         c: (lambda frames, true, c=c: recording(frames, state_poses(true, parse_pose_convention(c))), "poses",
-            f"{parse_pose_convention(c).describe()}.*they are not used", f"data.pose_convention={c}")
+            f"{re.escape(parse_pose_convention(c).describe())}.*they are not used", f"data.pose_convention={c}")
         for c in ("mm", "wxyz", "world_to_camera", "opengl", "world_to_camera+opengl")
     },
     **{
