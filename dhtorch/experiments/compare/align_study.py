@@ -30,7 +30,7 @@ from dhtorch.codes import is_estimated
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars
+from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars, mean_or_none
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress, spread_pairs
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
@@ -176,7 +176,8 @@ def run(
 
     def evaluate_scene(scene: Scene) -> Outcome:
         near = settings.cutoff_of(scene)
-        if note := _skip_reason(scene, near):
+        note = f"role {scene.role}" if scene.role is not None else None if near is not None else "no near limit"
+        if note := note or ("sparse sensor: no dense true map" if scene.recording.sparse else None):
             return Outcome([_scene_row(scene, _OURS, None) | {"note": note}])
         assert near is not None
         case_rows: dict[tuple[str, str], list[Row]] = {}
@@ -229,7 +230,7 @@ def summarise_alignment(rows: Sequence[Row], names: Sequence[str]) -> Row:
     summary["align.ratio_to_near_affine"] = median_ratio.entry("1")
     summary["align.worst_ratio_to_better"] = bootstrap.without_interval(max(worst) if worst else None, len(scenes))
     for key in ("within_sigma", "within_2sigma"):
-        means = [_mean_or_none([r[key] for r in network_rows if r["scene"] == scene]) for scene in scenes]
+        means = [mean_or_none([r[key] for r in network_rows if r["scene"] == scene]) for scene in scenes]
         summary[f"align.{key}"] = bootstrap.interval_over_scenes(means, statistic="mean").entry("1")
     return summary
 
@@ -248,17 +249,6 @@ def leave_one_scene_out(rows: Sequence[Row], names: Sequence[str]) -> Row:
                 "high": values[-1],
             }
     return left_out
-
-
-def _skip_reason(scene: Scene, near: float | None) -> str | None:
-    """Reason to leave a scene out; None if it can be evaluated."""
-    if scene.role is not None:
-        return f"role {scene.role}"
-    if near is None:
-        return "no near limit"
-    if scene.recording.sparse:
-        return "sparse sensor: no dense true map"
-    return None
 
 
 def _make_case(
@@ -359,7 +349,7 @@ def _median_relative_error(depth: Tensor, truth: Tensor, where: Tensor) -> float
 def _mean_over_frames(rows: Sequence[Row]) -> Row:
     """Rows of a scene's frames → the mean of every metric, and how often each model was selected."""
     metrics = ("median_rel", "answered", "within_sigma", "within_2sigma")
-    means: Row = {k: _mean_or_none([r[k] for r in rows if r[k] is not None]) for k in metrics if k in rows[0]}
+    means: Row = {k: mean_or_none([r[k] for r in rows if r[k] is not None]) for k in metrics if k in rows[0]}
     models = [r["model"] for r in rows if "model" in r]
     return (
         means
@@ -370,7 +360,3 @@ def _mean_over_frames(rows: Sequence[Row]) -> Row:
 
 def _scene_row(scene: Scene, method: str, fault: str | None) -> Row:
     return {"scene": scene.name, "pair": None, "method": method, "truth": fault, "role": scene.role}
-
-
-def _mean_or_none(values: Sequence[float]) -> float | None:
-    return sum(values) / len(values) if values else None

@@ -188,12 +188,6 @@ def live_pictures(scene: FixedScene, draws: int) -> Iterator[tuple[PlantedMove, 
             yield move, share, photograph_again(frame, draw)
 
 
-def reference_frame(scene: FixedScene) -> Frame:
-    """The reference with arms over a part of it, as a robot stands in its camera's view."""
-    draw = Random(f"{scene.name} reference")
-    return hide_behind_arms(scene.reference, _REFERENCE_SHARE, arm_seed=0, draw=draw)[0]
-
-
 def run(
     _scenes: Sequence[SceneLike],
     _chosen: Mapping[str, Method],
@@ -227,7 +221,10 @@ def run(
     places = [*(("room", seed) for seed in rooms), *(("robot", seed) for seed in robots)]
     for kind, seed in progress(places, "scenes", len(places)):
         scene = render_scene(kind, seed, (hw[0], hw[1]))
-        pin = CameraPin(reference_frame(scene), seed=settings.seed)
+        # the reference with arms over a part of it, as a robot stands in its camera's view
+        draw = Random(f"{scene.name} reference")
+        reference, _ = hide_behind_arms(scene.reference, _REFERENCE_SHARE, arm_seed=0, draw=draw)
+        pin = CameraPin(reference, seed=settings.seed)
         outcome.rows += [_picture_row(scene, pin, *picture) for picture in live_pictures(scene, draws)]
         times.append(_time_ratio(scene, pin))
         outcome.n_pairs = len(outcome.rows)

@@ -128,7 +128,9 @@ def run(
     todo: list[tuple[str, Any, list[float]]] = []
     for scene in scenes_of(scenes):
         near = settings.cutoff_of(scene)
-        if note := _skip_reason(scene, near):
+        usable = near is not None and scene.recording.poses is not None and not scene.recording.sparse
+        note = "" if usable else "no near limit, no poses or a sparse sensor"
+        if note := f"role {scene.role}" if scene.role is not None else note:
             outcome.rows.append(_row(scene.name, "maps", None) | {"note": note})
         elif near is not None:
             todo.append((scene.name, scene, [near, near]))
@@ -139,14 +141,6 @@ def run(
         outcome.n_pairs += len(case.frames)
     outcome.summary = summarise_scales(outcome.rows)
     return outcome.decide(QUESTION, EXPECTATION, *judge_bars(outcome.summary, SCALE_BARS))
-
-
-def _skip_reason(scene: Scene, near: float | None) -> str | None:
-    if scene.role is not None:
-        return f"role {scene.role}"
-    if near is None or scene.recording.poses is None or scene.recording.sparse:
-        return "no near limit, no poses or a sparse sensor"
-    return None
 
 
 def _row(scene: str, kind: str, fault: str | None) -> Row:
@@ -216,22 +210,32 @@ def make_scale_model(
     draw = np.random.default_rng(seed)
     F = len(scene.frames)
     gain = _frame_gains(F, fault, size, draw)
-    poses = _rescaled_poses(scene.poses, gain)
+    poses = scene.poses.copy()  # their steps are as long as the scale of their frames
+    steps = np.diff(poses[:, :3, 3], axis=0) * gain[1:, None]
+    poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, 0)
     typical = float(np.median(np.concatenate([z[(z > 0) & (z < near)][:500] for z in scene.depth])))
     centre, radius = _fault_region(scene, near, draw)
-    similarity = Similarity(float(np.exp(draw.uniform(-2, 2))), _random_rotation(draw), draw.normal(size=3))
+    near_quantiles = np.quantile(np.concatenate([z[(z > 0) & (z < near)][::7] for z in scene.depth]), (0.05, 0.95))
+    size_of_unit = float(np.exp(draw.uniform(-2, 2)))
+    q, r = np.linalg.qr(draw.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    similarity = Similarity(size_of_unit, q * np.sign(np.linalg.det(q)), draw.normal(size=3))
     views, clouds = [], []
     for i, frame in enumerate(scene.frames):
         z = scene.depth[i] * gain[i]
-        z = z * np.exp(noise.smooth * _smooth_field(z.shape, draw))
+        # a field of unit variance whose values a quarter of the map apart are independent
+        coarse = torch.from_numpy(draw.normal(size=(1, 1, 5, 5)))
+        smooth = torch.nn.functional.interpolate(coarse, z.shape, mode="bilinear", align_corners=True)[0, 0].numpy()
+        z = z * np.exp(noise.smooth * smooth)
         xyz = _unproject(frame, scene.depth[i]) @ scene.poses[i, :3, :3].T + scene.poses[i, :3, 3]
         if fault == "range":
-            low, high = _near_quantiles(scene, near)
+            low, high = near_quantiles
             along = np.clip(np.log(np.maximum(scene.depth[i], 1e-3) / low) / np.log(high / low), -0.5, 3.0)
             z = z * np.exp(np.log1p(size) * along)
         if fault == "region":
             z = np.where(np.linalg.norm(xyz - centre, axis=-1) < radius, z * (1 + size), z)
-        poses[i, :3, :3] = poses[i, :3, :3] @ _rotation(np.radians(noise.rotation_deg) * draw.normal(size=3))
+        turn = np.concatenate((np.radians(noise.rotation_deg) * draw.normal(size=3), np.zeros(3)))
+        poses[i, :3, :3] = poses[i, :3, :3] @ se3.exp(torch.from_numpy(turn)[None]).R[0].numpy()
         poses[i, :3, 3] += noise.position * typical * draw.normal(size=3)
         clouds.append(z)
     moved = similarity.move(poses)
@@ -309,14 +313,6 @@ def _frame_gains(F: int, fault: str | None, size: float, draw: np.random.Generat
     return gain
 
 
-def _rescaled_poses(poses: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Poses whose steps are as long as the scale of their frames says."""
-    moved = poses.copy()
-    steps = np.diff(poses[:, :3, 3], axis=0) * gain[1:, None]
-    moved[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, 0)
-    return moved
-
-
 def _fault_region(scene: ScaleScene, near: float, draw: np.random.Generator) -> tuple[np.ndarray, float]:
     """Centre and radius of a ball that contains a sixth of the near points."""
     clouds = []
@@ -328,35 +324,12 @@ def _fault_region(scene: ScaleScene, near: float, draw: np.random.Generator) -> 
     return centre, float(np.quantile(np.linalg.norm(xyz - centre, axis=1), 1 / 6))
 
 
-def _near_quantiles(scene: ScaleScene, near: float) -> tuple[float, float]:
-    z = np.concatenate([z[(z > 0) & (z < near)][::7] for z in scene.depth])
-    low, high = np.quantile(z, (0.05, 0.95))
-    return float(low), float(high)
-
-
 def _unproject(frame: Frame, depth: np.ndarray) -> np.ndarray:
     """Points (h, w, 3) of a map of the field of view of a frame."""
     uv = regular_grid_of((depth.shape[0], depth.shape[1]), frame.hw).double()
     camera = frame.camera.to(torch.float64)
     xyz = cam.unproject(cam.ideal(camera), cam.undistort(camera, uv), torch.from_numpy(depth).reshape(1, -1))
     return xyz[0].numpy().reshape(*depth.shape, 3)
-
-
-def _smooth_field(hw: tuple[int, ...], draw: np.random.Generator) -> np.ndarray:
-    """Field of unit variance whose values a quarter of the map apart are independent."""
-    coarse = torch.from_numpy(draw.normal(size=(1, 1, 5, 5)))
-    return torch.nn.functional.interpolate(coarse, hw, mode="bilinear", align_corners=True)[0, 0].numpy()
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    xi = torch.from_numpy(np.concatenate((vector, np.zeros(3))))[None]
-    return se3.exp(xi).R[0].numpy()
-
-
-def _random_rotation(draw: np.random.Generator) -> np.ndarray:
-    q, r = np.linalg.qr(draw.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
 
 
 # ----------------------------------------------------------------------------------------------------------- measuring

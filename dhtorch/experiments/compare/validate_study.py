@@ -234,9 +234,9 @@ def run(
     def evaluate_scene(scene: Scene) -> Outcome:
         load = partial(_load_frame, scene, settings)
         reference_rows = []
-        for i in progress(
-            _evenly_spaced(len(scene.recording), reference_views), f"{scene.name}: reference views", reference_views
-        ):
+        count = min(len(scene.recording), reference_views)
+        spread = [(2 * k + 1) * len(scene.recording) // (2 * count) for k in range(count)]
+        for i in progress(spread, f"{scene.name}: reference views", reference_views):
             reference_rows.append(_reference_row(scene, i, load, selecting_method, settings, size))
         firsts = _first_frames(len(scene.recording), windows)
         window_rows = [
@@ -335,10 +335,12 @@ def _reference_row(
     ).usable.unflatten(1, true_map.shape[-2:])
     for name in _PIXEL_FAULTS:
         faulty = true_map if name == "none" else apply_fault(name, true_map, seed=i, other=other_map)[0]
-        row |= _validated_counts("", name, faulty, true_map, validate(faulty), has_return)
-        row |= _validated_counts("quick_", name, faulty, true_map, validate_quick(faulty, views=False), has_return)
-        difference, state = photometric_difference(faulty, near, selected)
-        row |= {f"peer_{k}": v for k, v in _pixel_counts(name, faulty, true_map, difference, state, has_return).items()}
+        validations = {"": validate(faulty), "quick_": validate_quick(faulty, views=False)}
+        predictions = {prefix: (v.evidence.abs(), v.state) for prefix, v in validations.items()}
+        predictions["peer_"] = photometric_difference(faulty, near, selected)
+        for prefix, (score, state) in predictions.items():
+            counts = _pixel_counts(name, faulty, true_map, score, state, has_return)
+            row |= {f"{prefix}{k}": v for k, v in counts.items()}
     row["outline_alarms"] = _outline_alarms(validate(true_map))
     for name in RETURN_FAULTS:
         if name != "ghost":
@@ -411,13 +413,6 @@ def _make_validator(
     return selected, partial(
         validate_against, reference=reference, selected=selected, offered=offered, method=method, size=size
     )
-
-
-def _validated_counts(
-    prefix: str, name: str, faulty: Tensor, true_map: Tensor, validation: DepthValidation, has_return: Tensor
-) -> Row:
-    counts = _pixel_counts(name, faulty, true_map, validation.evidence.abs(), validation.state, has_return)
-    return {f"{prefix}{key}": value for key, value in counts.items()}
 
 
 def _pixel_counts(name: str, faulty: Tensor, true_map: Tensor, score: Tensor, state: Tensor, has_return: Tensor) -> Row:
@@ -596,11 +591,6 @@ def _true_map(recording: Recording, i: int, full: Frame, size: int, method: Meth
         return _depth_over_image(exact, size)
     samples = method.backproject(full, dense.map_pixel_centres(full, hw))
     return torch.where(samples.depth > 0, samples.depth, 0.0).unflatten(1, hw)
-
-
-def _evenly_spaced(n: int, count: int) -> list[int]:
-    count = min(n, count)
-    return [(2 * k + 1) * n // (2 * count) for k in range(count)]
 
 
 def _first_frames(n: int, count: int) -> list[int]:
