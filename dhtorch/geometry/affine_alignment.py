@@ -30,7 +30,7 @@ from dhtorch.geometry.determinism import MAX_CHUNK_POINTS, chunk_size
 from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.linalg import matmul_planes, solve_cholesky
-from dhtorch.geometry.lucas_kanade import masked_apply
+from dhtorch.geometry.lucas_kanade import is_between, masked_apply
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE, round_half_up
 from dhtorch.geometry.pyramid import (
     GRAD_X_PLANE,
@@ -220,7 +220,7 @@ def _flatten_points(
     B, N, _ = uv_0.shape
     xy_0, xy_1 = (uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N) for uv in (uv_0, uv_1.detach()))
     batch = torch.arange(B, device=uv_0.device).repeat_interleave(N)
-    usable = _inside(xy_0.detach(), source) & _inside(xy_1, target)
+    usable = is_between(xy_0.detach(), *source.bounds()) & is_between(xy_1, *target.bounds())
     xy_0, xy_1 = (torch.where(usable, y, torch.zeros_like(y)) for y in (xy_0, xy_1))
     return xy_0, xy_1, batch, usable
 
@@ -255,7 +255,9 @@ def _register(
     )
     # Residual noise variance at the end over that at the start, a ratio, above which a search has diverged.
     not_diverged = _noise(state.quality) <= 1.2 * _noise(best.quality)
-    ok = (state.textured & in_range & not_diverged & _inside(state.warp[0], target)) & (shift <= o.max_shift_px)
+    ok = (state.textured & in_range & not_diverged & is_between(state.warp[0], *target.bounds())) & (
+        shift <= o.max_shift_px
+    )
     best = _State(*(torch.where(ok, new, old) for new, old in zip(state, best, strict=True)))
     rms = best.quality[1].sqrt() / best.quality[0].clamp(*REGISTRATION_GAIN_RANGE)
     A = _linear(best.warp, o.window).transpose(0, 1)
@@ -539,11 +541,6 @@ def _compose(warp: Tensor, change: Tensor, window: int) -> Tensor:
     half = window // 2
     sides = matmul_planes(_inverse(_identity(change) + change[1:] / half), warp[1:])
     return torch.cat(((warp[0] - (sides * change[0, :, None]).sum(0) / half)[None], sides))
-
-
-def _inside(x: Tensor, pyramid: Pyramid) -> Tensor:
-    low, high = pyramid.bounds(0)
-    return ((x >= low) & (x <= high)).all(0)
 
 
 def _determinant(A: Tensor) -> Tensor:
