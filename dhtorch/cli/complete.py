@@ -38,7 +38,7 @@ from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import is_whole, open_output_folder
-from dhtorch.viz.plots import draw_completed
+from dhtorch.viz.plots import append_cutoff, draw_completed, format_frame
 
 #: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")
@@ -177,13 +177,26 @@ def complete_frame(task: CompletionTask, i: int) -> None:
     frame = task.recording[i]
     picture = resize_picture(frame, source.shape)
     for path in missing:
-        if path.suffix == ".png":
-            storage.replace_file(path, _render_completed(task, i, frame.image[0], maps, source))
-        elif path.suffix == ".jpg":
-            small = np.atleast_3d(picture).transpose(2, 0, 1)
-            storage.replace_file(path, _render_completed(task, i, small, maps, source, dpi=_PREVIEW_DPI, kind="jpg"))
+        if path.suffix in (".png", ".jpg"):  # a figure, or its preview from the small image
+            image: Any = frame.image[0]
+            options: dict[str, Any] = {}
+            if path.suffix == ".jpg":
+                image, options = np.atleast_3d(picture).transpose(2, 0, 1), {"dpi": _PREVIEW_DPI, "kind": "jpg"}
+            title = format_frame(task.scene.name, task.done[task.name(i)]["frame"])
+            options["title"] = append_cutoff(title, task.settings["cutoff"])
+            out = io.BytesIO()
+            draw_completed(out, image, maps["depth"], maps["sigma"], source, **options)
+            storage.replace_file(path, out.getvalue())
         else:
-            _write_points(path, frame, picture, **maps, source=source)
+            # In camera axes: points as PLY, or a mesh (edges across depth steps left out) as GLB
+            depth, hw = maps["depth"], (source.shape[0], source.shape[1])
+            z = torch.from_numpy(np.where(depth > 0, depth, np.nan)).reshape(1, -1)
+            xyz = cameras.unproject(frame.camera, dense.map_pixel_centres(frame, hw)[None], z)[0]
+            rgb = np.broadcast_to(picture if picture.ndim == 3 else picture[..., None], (*hw, 3)).reshape(-1, 3)
+            if path.suffix == ".ply":
+                export.write_ply(path, xyz, rgb, sigma=maps["sigma"].reshape(-1), source=source.reshape(-1))
+            else:
+                export.write_glb(path, [export.Shape("view", xyz, rgb, face=export.mesh_depth_map(depth))])
 
 
 @contextlib.contextmanager
@@ -296,30 +309,3 @@ def resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
     if image.shape[-2:] != hw:
         image = F.interpolate(image[None].float(), hw, mode="area")[0].round().to(torch.uint8)
     return image[0].numpy() if len(image) == 1 else image.permute(1, 2, 0).numpy()
-
-
-# ------------------------------------------------------------------------------------------------- figures and points
-
-
-def _render_completed(
-    task: CompletionTask, i: int, image: Any, maps: Mapping[str, np.ndarray], source: np.ndarray, **options: Any
-) -> bytes:
-    """The figure of a complete frame; ``maps`` and ``source`` from ``read_completed_maps``, options of the drawing."""
-    out = io.BytesIO()
-    options["title"] = completed.format_frame_title(task, i)
-    draw_completed(out, image, maps["depth"], maps["sigma"], source, **options)
-    return out.getvalue()
-
-
-def _write_points(
-    path: Path, frame: Frame, picture: np.ndarray, *, depth: np.ndarray, sigma: np.ndarray, source: np.ndarray
-) -> None:
-    """Write a frame in camera axes: points as PLY, or a mesh (edges across depth steps left out) as GLB."""
-    hw = depth.shape[0], depth.shape[1]
-    z = torch.from_numpy(np.where(depth > 0, depth, np.nan)).reshape(1, -1)
-    xyz = cameras.unproject(frame.camera, dense.map_pixel_centres(frame, hw)[None], z)[0]
-    rgb = np.broadcast_to(picture if picture.ndim == 3 else picture[..., None], (*hw, 3)).reshape(-1, 3)
-    if path.suffix == ".ply":
-        export.write_ply(path, xyz, rgb, sigma=sigma.reshape(-1), source=source.reshape(-1))
-    else:
-        export.write_glb(path, [export.Shape("view", xyz, rgb, face=export.mesh_depth_map(depth))])

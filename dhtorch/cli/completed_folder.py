@@ -37,7 +37,6 @@ from dhtorch.records import Camera, Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import is_whole, open_output_folder
-from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
 
@@ -350,11 +349,6 @@ def load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
     if 0 in frame.hw:
         raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
     return range_split(frame, settings["cutoff"])
-
-
-def format_frame_title(task: CompletionTask, i: int) -> str:
-    """Figure title: capture, frame, cutoff."""
-    return append_cutoff(format_frame(task.scene.name, task.done[task.name(i)]["frame"]), task.settings["cutoff"])
 
 
 def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -158,25 +158,20 @@ def _contents(scene: FetchedScene, names: Sequence[str], parts: Path, max_bytes:
 
 def _finish(scene: FetchedScene, name: str, content: bytes, where: str) -> bytes:
     """Content of a file, cut to its rows, with the right digest."""
-    if name in scene.cut:
-        content = _cut(content, scene.cut[name])
+    cut, lines = scene.cut.get(name, {}), content.splitlines(keepends=True)
+    if "rows" in cut:  # first and last, from 0
+        first, last = cut["rows"]
+        content = b"".join(lines[int(first) : int(last) + 1])
+    elif cut:  # comments, and the lines between two times
+        low, high = cut["times"]
+        kept = []
+        for line in lines:
+            with contextlib.suppress(IndexError, ValueError):  # a line without a number is in no span of times
+                if line.startswith(b"#") or low <= float(line.split()[0]) <= high:
+                    kept.append(line)
+        content = b"".join(kept)
     _check_digest(_sha256(content), scene.files[name], where)
     return content
-
-
-def _cut(content: bytes, cut: Mapping[str, list[float]]) -> bytes:
-    """Lines of a text: ``rows`` (first, last, from 0), or comments and the lines of ``times`` (first, last)."""
-    lines = content.splitlines(keepends=True)
-    if "rows" in cut:
-        first, last = cut["rows"]
-        return b"".join(lines[int(first) : int(last) + 1])
-    low, high = cut["times"]
-    kept = []
-    for line in lines:
-        with contextlib.suppress(IndexError, ValueError):  # a line without a number is in no span of times
-            if line.startswith(b"#") or low <= float(line.split()[0]) <= high:
-                kept.append(line)
-    return b"".join(kept)
 
 
 def download(address: str, folder: Path, digest: str | None, max_bytes: int = MAX_BYTES) -> Path:

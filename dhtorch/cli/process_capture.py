@@ -461,7 +461,11 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
     reader = {name: value for name, value in settings["data"].items() if name not in ("path", "format")}
     if settings["reader_format"] != "auto":
         reader["format"] = settings["reader_format"]
-    words = [f"data.{name}={_format_value(value)}" for name, value in reader.items() if value is not None]
+    words = []  # values as written on the command line
+    for name, value in reader.items():
+        if value is not None:
+            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            words.append(f"data.{name}={text.lower() if isinstance(value, bool) else text}")
     cutoff = 2.0  # m, where no completed frame has a return
     median = recover_page.measure_median_return(task, recovered.frames)
     if median is not None:  # rounded up to two digits
@@ -469,9 +473,3 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
         cutoff = math.ceil(median / step - 1e-9) * step
     command = shlex.join(["dhtorch", "run", str(settings["path"]), *words, "--cutoff", f"{cutoff:g}"])
     return f"Next: open {shown}; to measure the error on your capture: {command}{broken}"
-
-
-def _format_value(value: Any) -> str:
-    """A value as written on the command line."""
-    listed = isinstance(value, list)
-    return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)

@@ -692,7 +692,6 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     except Exception as error:
         cause = unwrap_cause(error)
         root = cfg.data.get("root")
-        _reject_stacks(cause, root)
         below = _find_capture_below(cause, root)
         if below is None:
             raise
@@ -704,14 +703,19 @@ def _find_capture_below(error: BaseException, root: Any) -> str | None:
     """The only recording below a path that is none itself; None without one, or for another error.
 
     Raises:
-        ValueError: several, or captures of other kinds (focal stacks, images without depth).
+        ValueError: several, or captures of other kinds: focal stacks, which are no recording, images without depth.
         FormatError: a folder below that lacks a part of its layout.
     """
     from dhtorch.cli.process_capture import find_recording_captures  # noqa: PLC0415
     from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
+    from dhtorch.experiments.focal.formats import recognise_stacks  # noqa: PLC0415
 
     if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
         return None
+    with contextlib.suppress(FormatError):
+        actual = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), images of one view"
+        expected = "a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
+        raise ValueError(f"{actual}, expected {expected}") from error
     try:
         captures = [str(each.path) for each in find_recording_captures(Path(str(root)))]
     except FormatError as lack:
@@ -722,19 +726,6 @@ def _find_capture_below(error: BaseException, root: Any) -> str | None:
         names = ", ".join(captures[:_MAX_CAPTURES_SHOWN]) + (", …" if len(captures) > _MAX_CAPTURES_SHOWN else "")
         raise ValueError(f"{root}: found {len(captures)} captures below, expected one of {names}") from error
     return captures[0] if captures else None
-
-
-def _reject_stacks(error: BaseException, root: Any) -> None:
-    """Raise a clearer error if the data are focal stacks, which are not a recording."""
-    from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
-    from dhtorch.experiments.focal.formats import recognise_stacks  # noqa: PLC0415
-
-    if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
-        return
-    with contextlib.suppress(FormatError):
-        actual = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), images of one view"
-        expected = "a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
-        raise ValueError(f"{actual}, expected {expected}") from error
 
 
 def _format_resume_command(argv: Iterable[str], folder: Path) -> str:

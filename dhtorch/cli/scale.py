@@ -168,7 +168,18 @@ def _write_page(path: Path, name: str, result: ScaleResult) -> None:
         difference = float(np.expm1(log - np.log(result.scale)))
         cells = (str(match.frame), how, f"{np.exp(log):.5g}", f"{difference:+.2%}", f"{result.frame_sigma[k]:.2%}")
         frames.append(pages.ValidatedFrame(result.names[k], cells))
-    plots = [pages.ValidatedFrame(title, (), png) for title, png in _plots(result)]
+    # Differences of scale over frames, image regions and range
+    off = result.frame_log - np.log(result.scale)
+    of_frames = list(zip(map(float, range(len(off))), off.tolist(), result.frame_sigma.tolist(), strict=True))
+    of_regions = [(float(k), change, sigma) for k, (_, _, change, sigma) in enumerate(_regions(result))]
+    plots = [
+        pages.ValidatedFrame(title, (), _plot(label, values))
+        for title, label, values in (
+            ("scale of every frame", "view, in the order of the capture", of_frames),
+            ("scale of every picture region", "region, row by row", of_regions),
+            ("scale by range", "m", [((a + b) / 2, change, 0.0) for a, b, change, _ in result.by_range]),
+        )
+    ]
     pages.write_validation_page(
         path,
         f"{name}: {'refused' if result.faults else 'metric scale'}",
@@ -179,19 +190,6 @@ def _write_page(path: Path, name: str, result: ScaleResult) -> None:
         word="scale",
         note=_NOTE,
     )
-
-
-def _plots(result: ScaleResult) -> list[tuple[str, bytes]]:
-    """(title, PNG) of the differences of scale over frames, picture regions and range."""
-    off = result.frame_log - np.log(result.scale)
-    frames = list(zip(map(float, range(len(off))), off.tolist(), result.frame_sigma.tolist(), strict=True))
-    regions = [(float(k), change, sigma) for k, (_, _, change, sigma) in enumerate(_regions(result))]
-    ranges = [((a + b) / 2, change, 0.0) for a, b, change, _ in result.by_range]
-    return [
-        ("scale of every frame", _plot("view, in the order of the capture", frames)),
-        ("scale of every picture region", _plot("region, row by row", regions)),
-        ("scale by range", _plot("m", ranges)),
-    ]
 
 
 def _plot(label: str, rows: list[tuple[float, float, float]]) -> bytes:

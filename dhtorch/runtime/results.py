@@ -398,8 +398,13 @@ def make_portable(config: Mapping[str, Any], base: str | Path | None = None) -> 
             return {str(k): shorten(str(k), v) for k, v in value.items() if k not in _LOCAL_OPTIONS}
         if isinstance(value, list | tuple):
             return [shorten(name, v) for v in value]
-        is_place = isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())
-        return _shorten_path(Path(value), base) if is_place else value
+        if not (isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())):
+            return value
+        resolved = Path(value).expanduser().resolve()
+        within = None if base is None else Path(base).expanduser().resolve()
+        if within is not None and resolved != within and resolved.is_relative_to(within):
+            return resolved.relative_to(within).as_posix()
+        return resolved.name
 
     return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _LOCAL_OPTIONS}
 
@@ -484,15 +489,6 @@ def _iter_paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
             yield from _iter_paths(f"{name}.{k}", inner)
     elif isinstance(value, str) and (os.sep in value or Path(value).suffix):
         yield name, Path(value).expanduser()
-
-
-def _shorten_path(path: Path, base: str | Path | None) -> str:
-    resolved = path.expanduser().resolve()
-    if base is not None:
-        resolved_base = Path(base).expanduser().resolve()
-        if resolved != resolved_base and resolved.is_relative_to(resolved_base):
-            return resolved.relative_to(resolved_base).as_posix()
-    return resolved.name
 
 
 def read_git_revision(folder: Path) -> str | None:

@@ -21,6 +21,7 @@ from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
+from dhtorch.geometry import se3
 from dhtorch.geometry.camera import resize
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import completion, dense
@@ -315,6 +316,17 @@ def test_a_frame_alone_gets_the_sensor_and_maps_without_poses_are_maps_alone(roo
     assert not (tmp_path / "poses.txt").exists() and not (tmp_path / "images").exists()
     row = storage.parse_strict_json((tmp_path / "meta" / "000000.json").read_text())
     assert row["views"] == [] and row["T_world_from_cam"] is None and row["time"] is None
+
+
+def test_without_poses_the_meta_files_state_the_motions_that_were_solved(room, tmp_path):
+    said([Recording("three", "made", room.load, room.number[:3])], tmp_path)
+    for i in range(3):
+        row = storage.parse_strict_json((tmp_path / "meta" / f"{i:06d}.json").read_text())
+        assert row["motions"] and {*row["motions"]} <= {*map(str, row["views"])}
+        for number, matrix in row["motions"].items():
+            k = int(number)
+            true = se3.to_matrix(se3.relative(room.poses[i : i + 1], room.poses[k : k + 1]))[0]
+            torch.testing.assert_close(torch.tensor(matrix, dtype=torch.float64), true, atol=0.02, rtol=0)
 
 
 def test_several_scenes_have_a_folder_each_and_a_name_once(room, tmp_path):

@@ -220,6 +220,8 @@ VALUES = [
     (lambda: [c.sigma_rel for c in CAMERAS], approx([0.02, 0.1], rel=0.03)),
     (lambda: next(iter(CAMERAS[1].format_kinds().values()))[:20], "2.5% (median sigma 1"),
     (lambda: enrich_page._pixel_shares([{"pixels": [], "no_answer": []}])[0]["no_answer"], 1.0),
+    (lambda: [CAMERAS[0]._replace(kinds={"recovered": x}, sigma_rel=y).format_kinds()["recovered"] for x, y in ((0.1, math.nan), (0.0, 0.02))],
+     ["10.0%", "0.0%"]),
     (lambda: [*enrich_page._average_over_episodes(OVER_TIME, "x")[0][1].T.tolist()], [[0.5, 1.0], [0.75, 0.75], [1.0, 0.5]]),
     (lambda: refuted(the_inverse=3), ["a: the input poses contradict the near returns in 3 of 9 frames; they fit as the inverse"]),
     (lambda: refuted(the_inverse=3, unknown=1)[0][-33:], "4 of 9 frames; they fit as the inverse (3)"[-33:]),
