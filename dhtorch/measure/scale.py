@@ -55,13 +55,13 @@ from dhtorch.stages.track import lucas_kanade
 #: of a return in :func:`dhtorch.stages.backproject.backproject`.
 _UNSTATED_SENSOR_SIGMA = 0.01
 
-#: Places in a picture that are compared. Source: origin not recorded.
+#: Pixels of an image that are compared, a count. Source: the rates of scale_study hold for it.
 _PLACES = 800
 
-#: Fewest tracks of a registration, and fewest matched frames that can show a fault. Source: origin not recorded.
+#: Fewest tracks of a registration, and fewest matched frames that can show a fault: counts. Source: as above.
 _MIN_TRACKS, _MIN_FRAMES = 40, 3
 
-#: Frames that are searched for the picture of a view, per view compared. Source: origin not recorded.
+#: Frames that are searched for the image of a view, per view compared, a count. Source: as above.
 _FRAMES_PER_VIEW = 4
 
 #: Most motions between views that are measured, a count. Source: chosen, five in each stretch of the path.
