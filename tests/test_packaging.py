@@ -167,7 +167,7 @@ def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "extra",
-    ["all", "live", "learned", "view", "matchers", "robot", "scale", "ray-launcher", "peers", "docs", "dev"],
+    ["all", "live", "learned", "view", "matchers", "scale", "ray-launcher", "peers", "docs", "dev"],
 )
 def test_extras_can_be_resolved(wheel, extra):
     """Dry run against the index, with the pinned torch."""

@@ -52,9 +52,9 @@ class Survey:
         """Add a fact."""
         self.facts.append((what, text))
 
-    def warn(self, text: str) -> None:
-        """Add a warning."""
-        self.warnings.append(text)
+    def warn(self, text: str, when: bool = True) -> None:
+        """Add a warning, unless ``when`` is false."""
+        self.warnings += [text] * when
 
 
 def survey_recording(
@@ -117,19 +117,16 @@ def _report_times(times: Tensor | None, rate_hz: float | None, out: Survey) -> N
     nominal = f"nominal {rate_hz:.3g} Hz" if rate_hz else ""
     if times is None or len(times) < 2:
         out.add_fact("rate", nominal or "not known")
-        if times is None:
-            out.warn("no time stamps")
+        out.warn("no time stamps", times is None)
         return
     step = times.diff()
     median_step = float(step.median())
     measured = f"{1 / median_step:.4g} Hz" if median_step > 0 else "0 s from frame to frame"
     out.add_fact("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
     out.add_fact("duration", f"{float(times[-1] - times[0]):.3f} s")
-    if bool((step <= 0).any()):
-        out.warn(f"time stamps do not increase at {format_count(int((step <= 0).sum()), 'place')}")
-    gaps = step > 2.5 * median_step
-    if bool(gaps.any()):
-        out.warn(f"{format_count(int(gaps.sum()), 'gap')} in time, the longest {float(step.max()):.3f} s")
+    backward, gaps = int((step <= 0).sum()), int((step > 2.5 * median_step).sum())
+    out.warn(f"time stamps do not increase at {format_count(backward, 'place')}", backward > 0)
+    out.warn(f"{format_count(gaps, 'gap')} in time, the longest {float(step.max()):.3f} s", gaps > 0)
 
 
 def _report_pictures(shots: Sequence[Frame], out: Survey) -> None:
@@ -142,8 +139,7 @@ def _report_pictures(shots: Sequence[Frame], out: Survey) -> None:
     out.add_fact("pictures", f"{w}x{h}, {describe_pixels(image.shape[1], image)}")
     warn_of_duplicates([s.image[0] for s in shots], out, "frames")
     brightness = torch.stack([patches.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
-    if float(brightness.max()) < 0.02:
-        out.warn("all pictures are black")
+    out.warn("all pictures are black", float(brightness.max()) < 0.02)
 
 
 def describe_pixels(channels: int, images: Tensor) -> str:
@@ -153,8 +149,8 @@ def describe_pixels(channels: int, images: Tensor) -> str:
 
 def warn_of_duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
     """Add a warning where several images are all equal."""
-    if len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:]):
-        out.warn(f"all {what} that were read are the same picture")
+    alike = len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:])
+    out.warn(f"all {what} that were read are the same picture", alike)
 
 
 def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
@@ -172,14 +168,10 @@ def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", spars
     table = ", ".join(f"{p} %: {x:.3f}" for p, x in zip(_DEPTH_PERCENTILES, ranks.tolist(), strict=True))
     out.add_fact("depth percentiles", f"{table} m")
     out.add_fact("depth range", f"{float(values.min()):.3f} to {float(values.max()):.3f} m")
-    empty = int((holes == 1).sum())
-    if empty:
-        out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
-    # Fraction of a depth map's pixels without depth above which a warning is issued.
-    elif float(holes.mean()) > 0.5 and not sparse:
-        out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
-    if float(values.max() - values.min()) < 1e-3:
-        out.warn("depth is the same everywhere")
+    empty, mean = int((holes == 1).sum()), float(holes.mean())
+    out.warn(f"{empty} of {len(depths)} depth maps that were read are empty", empty > 0)
+    out.warn(f"most of the depth map is holes ({100 * mean:.0f} %)", not empty and mean > 0.5 and not sparse)
+    out.warn("depth is the same everywhere", float(values.max() - values.min()) < 1e-3)
 
 
 def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
@@ -189,8 +181,7 @@ def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
     percent = (100 * counts / counts.sum().clamp(min=1)).tolist()
     levels = zip(("low", "medium", "high"), percent, strict=True)
     out.add_fact("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in levels))
-    if max(percent) > 99.99:
-        out.warn("confidence is the same everywhere")
+    out.warn("confidence is the same everywhere", max(percent) > 99.99)
 
 
 def _report_cameras(shots: Sequence[Frame], out: Survey) -> None:
@@ -204,11 +195,10 @@ def _report_cameras(shots: Sequence[Frame], out: Survey) -> None:
     if shots[0].depth_camera is not None and min(shots[0].hw) > 0:
         out.add_fact("of the depth", describe_camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
     fx, fy = first.f[0].tolist()
-    if not 0.95 < fx / fy < 1.05:
-        out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square")
+    out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square", not 0.95 < fx / fy < 1.05)
     centre = torch.tensor([hw[1], hw[0]]) / 2
-    if min(hw) > 0 and bool(((first.c[0] - centre).abs() > 0.3 * centre).any()):
-        out.warn("the principal point is far from the middle of the picture")
+    off = min(hw) > 0 and bool(((first.c[0] - centre).abs() > 0.3 * centre).any())
+    out.warn("the principal point is far from the middle of the picture", off)
 
 
 def describe_camera(camera: Camera, hw: tuple[int, int]) -> str:
@@ -244,14 +234,12 @@ def _report_poses(recording: Recording, out: Survey) -> None:
     out.add_fact("path", f"{length:.3f} m long inside a box of {extent:.3f} m, {total_deg:.1f}° of turning")
     median = f"{float(step.median()):.4f} m and {math.degrees(float(rotation.median())):.2f}° from frame to frame"
     out.add_fact("step", f"{median}, at most {float(step.max()):.3f} m")
-    if float(step.sum()) < _MIN_MOTION_M and float(rotation.sum()) < 1e-3:
-        out.warn("poses are constant")
-    elif extent < _MIN_MOTION_M:
-        out.warn("the camera turns but does not move: there is no baseline")
+    is_constant = length < _MIN_MOTION_M and float(rotation.sum()) < 1e-3
+    out.warn("poses are constant", is_constant)
+    out.warn("the camera turns but does not move: there is no baseline", not is_constant and extent < _MIN_MOTION_M)
     if recording.times is not None:
         speed = step / recording.times.diff().clamp(min=1e-9)
         out.add_fact("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
         # Speed in m/s above which a step of the trajectory counts as a jump: hand-held cameras do not move so fast.
-        if float(speed.max()) > 5.0 and not recording.sparse:
-            number = int(recording.number[int(speed.argmax()) + 1])
-            out.warn(f"the camera jumps: {float(speed.max()):.1f} m/s at frame {number}")
+        fastest, number = float(speed.max()), int(recording.number[int(speed.argmax()) + 1])
+        out.warn(f"the camera jumps: {fastest:.1f} m/s at frame {number}", fastest > 5.0 and not recording.sparse)

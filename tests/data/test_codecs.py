@@ -147,7 +147,7 @@ def test_exr_chooses_its_channel_and_its_header_decides_before_the_decoder(
     file.write_bytes(damage(file.read_bytes()))
     if isinstance(answer, int):
         assert codec_exr.read_exr(file, **options)[0, 0] == answer
-        assert codec_exr.read_exr_header(file) == ((4, 6), tuple(channels))
+        assert codec_exr.decode_exr_header(file.read_bytes(), file) == ((4, 6), tuple(channels))
     else:
         with pytest.raises(FormatError, match=answer):
             codec_exr.read_exr(file, **options)

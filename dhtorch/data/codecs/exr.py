@@ -61,17 +61,12 @@ def decode_exr(data: bytes, file: Path, channel: str | None = None, hw: tuple[in
     return pixels.astype(np.float32)
 
 
-def read_exr_header(file: Path) -> ExrHeader:
-    """Size and channels of an EXR file without decoding it.
+def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
+    """Size and channels of an EXR file in memory without decoding it; ``file`` names it in errors.
 
     Raises:
-        FormatError: missing, truncated or unknown file, several parts, tiles, or more than ``MAX_PIXELS`` pixels.
+        FormatError: truncated or unknown file, several parts, tiles, or more than ``MAX_PIXELS`` pixels.
     """
-    return decode_exr_header(read_bytes(file), file)
-
-
-def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
-    """As :func:`read_exr_header`, of bytes in memory; ``file`` names them in errors."""
     if not data.startswith(b"\x76\x2f\x31\x01"):
         raise FormatError(file, "content", f"{data[:4]!r}", "an OpenEXR image")
     try:

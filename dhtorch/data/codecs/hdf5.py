@@ -46,12 +46,7 @@ class Hdf5Array(NamedTuple):
         """
         if not 0 <= i < self.shape[0]:
             raise IndexError(f"{self.file}: {self.key}: entry {i} of {self.shape[0]}")
-        with _open_hdf5(self.file) as group:
-            array = _check_array(group, self.key, self.file)
-            if array.shape != self.shape or array.dtype != self.dtype:
-                problem = f"{array.dtype} of {array.shape}"
-                raise FormatError(self.file, self.key, problem, f"{self.dtype} of {self.shape}")
-            return np.asarray(array[i])
+        return self._read(i)
 
     def values(self) -> np.ndarray:
         """All entries of a small array, such as the poses of an episode.
@@ -61,11 +56,15 @@ class Hdf5Array(NamedTuple):
         """
         size = math.prod(self.shape) * self.dtype.itemsize
         check_memory(self.file, self.key, size, f"an array of {self.shape}")
+        return self._read(())
+
+    def _read(self, index: int | tuple[()]) -> np.ndarray:
         with _open_hdf5(self.file) as group:
             array = _check_array(group, self.key, self.file)
             if array.shape != self.shape or array.dtype != self.dtype:
-                raise FormatError(self.file, self.key, f"{array.dtype} of {array.shape}", "an unchanged file")
-            return np.asarray(array[()])
+                problem = f"{array.dtype} of {array.shape}"
+                raise FormatError(self.file, self.key, problem, f"{self.dtype} of {self.shape}")
+            return np.asarray(array[index])
 
 
 def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
