@@ -35,7 +35,6 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rosbag_index import (
     BagIndex,
     ImageStream,
-    TopicCamera,
     differ_in_size_alone,
     find_camera,
     index_bag,
@@ -191,14 +190,13 @@ def _open_pair(
     option = intrinsics_options.parse_intrinsics(bag.root, hw, *K_options)
     if option.feature is not None:
         raise FormatError(bag.root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
+    camera, remarks = find_camera(bag, colour) if option.K is None else (None, [])
     if option.K is not None:
-        eye: TopicCamera | None = TopicCamera(convert.to_camera(convert.make_K(*option.K), hw, bag.root, "option K"))
-    else:
-        eye = find_camera(bag, colour)
-    if eye is None:
+        camera = convert.to_camera(convert.make_K(*option.K), hw, bag.root, "option K")
+    if camera is None:
         raise intrinsics_options.missing_intrinsics_error(bag.root, None, f"a CameraInfo of {colour.base}")
-    depth_eye = find_camera(bag, depth)
-    depth_camera, T, remarks = _relate(bag, pair, eye.camera, depth_eye)
+    own_camera, depth_remarks = find_camera(bag, depth)
+    depth_camera, T, related = _relate(bag, pair, camera, own_camera)
     times = [np.array(stream.stamps_ns, np.int64) for stream in (colour, depth)]
     origin = int(times[0][0])
     pairs = pair_stamps(*((stamps - origin) / 1e9 for stamps in times))
@@ -206,7 +204,7 @@ def _open_pair(
         problem = f"{len(times[0])} pictures of {colour.topic.name}, {len(times[1])} of {depth.topic.name}, none paired"
         raise FormatError(bag.root, "time stamps", problem, "stamps within half a period")
     left_out = sorted(set(range(len(times[0]))) - set(pairs[:, 0].tolist()))
-    report = [*option.report, *eye.report, *(depth_eye.report if depth_eye is not None else ()), *remarks]
+    report = [*option.report, *remarks, *depth_remarks, *related]
     report += files.format_left_out(left_out, f"no depth of {depth.topic.name} within half a period")
     c2w, pairs, pose_remarks = _find_poses(bag, colour, times[0], pairs, use_poses)
     unit = _depth_unit(bag, depth)
@@ -221,7 +219,7 @@ def _open_pair(
             compressed=(colour.compressed, depth.compressed),
             hw=hw,
             depth_hw=depth_hw,
-            camera=eye.camera,
+            camera=camera,
             depth_camera=depth_camera,
             T_colour_from_depth=T,
             metres=1.0 if unit is None else unit.metres,
@@ -238,17 +236,16 @@ def _open_pair(
 
 
 def _relate(
-    bag: BagIndex, pair: _Pair, camera: Camera, depth_eye: TopicCamera | None
+    bag: BagIndex, pair: _Pair, camera: Camera, own: Camera | None
 ) -> tuple[Camera | None, Pose | None, list[str]]:
     """(camera of the depth or None where it is the colour's, T_colour_from_depth or None, remarks)."""
     hw, depth_hw = pair.colour.hw, pair.depth.hw
-    if depth_eye is None:
+    if own is None:
         if pair.registered or hw == depth_hw:
             remark = f"{pair.depth.topic.name} has no CameraInfo: taken as registered to {pair.colour.topic.name}"
             return None, None, [] if pair.registered else [remark]
         size = f"{depth_hw[1]}x{depth_hw[0]}"
         raise FormatError(bag.root, pair.depth.topic.name, f"depth of {size} without a CameraInfo", "one beside it")
-    own = depth_eye.camera
     T: np.ndarray | None = np.eye(4)
     if not pair.registered:
         T = _find_extrinsics(bag, pair)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -166,15 +166,8 @@ def _describe_stream(message: IndexedMessage, head: Any, *, compressed: bool) ->
 # ------------------------------------------------------------------------------------------------------------ cameras
 
 
-class TopicCamera(NamedTuple):
-    """Camera of a topic."""
-
-    camera: Camera
-    report: tuple[str, ...] = ()
-
-
-def find_camera(bag: BagIndex, stream: ImageStream) -> TopicCamera | None:
-    """Camera of a topic from the CameraInfo beside it, else from the only one of its frame; None without any."""
+def find_camera(bag: BagIndex, stream: ImageStream) -> tuple[Camera | None, list[str]]:
+    """(camera of a topic, remarks) from the CameraInfo beside it, else from the only one of its frame; None without."""
     parent = stream.base.rpartition("/")[0]
     names = [f"{parent}/camera_info", f"{stream.base}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info"]
     name = next((name for name in names if name in bag.infos), None)
@@ -183,19 +176,19 @@ def find_camera(bag: BagIndex, stream: ImageStream) -> TopicCamera | None:
         of_frame = [n for n, info in bag.infos.items() if frame and info.header.frame_id == frame and info.k[0] > 0]
         name = of_frame[0] if len(of_frame) == 1 else None
     if name is None or not bag.infos[name].k[0] > 0:  # 0 = not calibrated
-        return None
+        return None, []
     info, where = bag.infos[name], Path(f"{bag.root}{name}")
     is_rectified = "rect" in stream.base.rpartition("/")[2] and info.p[0] > 0
     D = None if is_rectified else ros_images.to_opencv_distortion(info, where)
     K, hw = crop_camera(info.p.reshape(3, 4)[:, :3] if is_rectified else info.k.reshape(3, 3), info)
-    report: tuple[str, ...] = ()
+    remarks = []
     if hw != stream.hw:
         h, w = stream.hw
         if abs(w * hw[0] - h * hw[1]) > max(h, w):  # more than a pixel off the calibration's aspect
             raise FormatError(where, "width, height", f"{hw[1]}x{hw[0]}", f"{w}x{h} as {stream.topic.name}")
         K = convert.resize_K(K, hw, stream.hw)
-        report = (f"{stream.topic.name}: K of {hw[1]}x{hw[0]} pixels is scaled to {w}x{h}",)
-    return TopicCamera(convert.to_camera(K, stream.hw, where, "P" if is_rectified else "K", D), report)
+        remarks.append(f"{stream.topic.name}: K of {hw[1]}x{hw[0]} pixels is scaled to {w}x{h}")
+    return convert.to_camera(K, stream.hw, where, "P" if is_rectified else "K", D), remarks
 
 
 def crop_camera(K: np.ndarray, info: Any) -> tuple[np.ndarray, tuple[int, int]]:
