@@ -236,14 +236,6 @@ def test_the_page_holds_what_was_computed(scene):
         assert ((shot.samples["cause"] > 0) == has_depth).all() and (shot.swept.cause > 0).all()
         assert (shot.samples["cause"][shot.samples["source"] == Source.SENSOR] == 3).all(), "the reference"
         assert (unpacked(sent["swept"]["cause"]) == shot.swept.cause).all()
-        uv = unpacked(sent["samples"]["uv_1"]).reshape(-1, 2) / data["per_pixel"] - data["margin_px"]
-        assert np.abs(uv - shot.samples["uv_1"])[shot.samples["tracked"]].max() <= 0.5 / data["per_pixel"] + 1e-4
-        for name in ("seen", "swept"):
-            packed, cloud = sent[name], getattr(shot, name)
-            xyz = unpacked(packed["xyz"]).reshape(-1, 3) * packed["step"] + packed["low"]
-            assert np.abs(xyz - cloud.xyz).max() < 1e-3 and (unpacked(packed["rgb"]) == cloud.rgb.ravel()).all()
-        assert (unpacked(sent["swept"]["sigma"]) == shot.swept.sigma).all()
-        assert np.abs(unpacked(sent["swept"]["score"]) / 65535 - shot.swept.score).max() < 1e-4
         jpeg = base64.b64decode(data["views"][sent["view_0"]]["jpeg"])
         assert jpeg[:2] == b"\xff\xd8"
 
@@ -620,7 +612,3 @@ def test_broken_points_are_refused(tmp_path, content):
     (tmp_path / "p.ply").write_bytes(content)
     with pytest.raises(ValueError, match=r"p\.ply"):
         points.read_ply_exhibit(tmp_path / "p.ply")
-
-
-def test_the_viewer_says_what_it_offers():
-    assert {"Exhibit", "ExhibitView", "PairExhibit"} <= set(viewer.__all__)

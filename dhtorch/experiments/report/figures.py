@@ -42,7 +42,7 @@ from dhtorch.viz.plots.colours import (
     SOURCE_COLOURS,
     Stroke,
 )
-from dhtorch.viz.plots.figures import PAPER_MARK, set_rows
+from dhtorch.viz.plots.figures import PAPER_MARK, draw_rows, set_rows
 from dhtorch.viz.plots.samples import MIN_CURVE_ANSWERS, PointLayer, draw_points
 
 #: Relative errors drawn on a logarithmic axis, from and to.
@@ -111,14 +111,12 @@ def _side_by_side(result: Result) -> Figure | None:
     strokes = assign_strokes(rows)
     for axes, metric in zip(panels, measured, strict=True):
         cited = {k: n for k, v in enumerate(rows) if (n := counterparts.get(v, {}).get(metric)) is not None}
-        for k, (v, e) in enumerate(entries[metric].items()):
-            ends = [np.nan if e.get(name) is None else e[name] for name in ("low", "value", "high")]
-            axes.plot(ends[::2], [k, k], **strokes[v].options())
-            axes.plot(ends[1], k, "o", color=strokes[v].colour)
+        ours = [[e.get(name) for name in ("low", "value", "high")] for e in entries[metric].values()]
+        draw_rows(axes, ours, [stroke.colour for stroke in strokes.values()])
         axes.plot(list(cited.values()), list(cited), **PAPER_MARK)
         set_rows(axes, rows)
-        ours = [e.get(name) for e in entries[metric].values() for name in ("value", "low", "high")]
-        set_axis(axes, "x", _MEASURED[metric], **metric_axis(metric, [*ours, *cited.values()]))
+        values = [*(end for interval in ours for end in interval), *cited.values()]
+        set_axis(axes, "x", _MEASURED[metric], **metric_axis(metric, values))
     add_legend(figure, {"published": PAPER_MARK} if any(counterparts.values()) else {})
     caption = "Dots: median over scenes; lines: 95 % interval of a bootstrap over scenes."
     return Figure("Variants side by side", caption, figure)
@@ -133,11 +131,10 @@ def _latency(result: Result) -> Figure | None:
     cited = {name: number for name, cell in printed.items() if (number := parse_printed(cell))}
     strokes = dict(zip(("front end and pair", "single stages", "visual branch"), SERIES_COLOURS[:5:2], strict=True))
     figure, (axes,) = make_figure(size=(720, 66 + 19 * (len(rows) + len(cited))))
-    for k, row in enumerate(rows):
-        kind = "visual branch" if row.get("stage") == "forward" else "single stages"
-        colour = strokes["front end and pair" if is_whole_branch(row) and kind == "single stages" else kind]
-        axes.plot([row["p50_ms"], row.get("p99_ms") or row.get("p95_ms")], [k, k], color=colour, linewidth=1.8)
-        axes.plot(row["p50_ms"], k, "o", color=colour)
+    whole = ["front end and pair" if is_whole_branch(row) else "single stages" for row in rows]
+    kinds = ["visual branch" if row.get("stage") == "forward" else kind for row, kind in zip(rows, whole, strict=True)]
+    intervals = [[row["p50_ms"], row["p50_ms"], row.get("p99_ms") or row.get("p95_ms")] for row in rows]
+    draw_rows(axes, intervals, [strokes[kind] for kind in kinds])
     axes.plot(list(cited.values()), range(len(rows), len(rows) + len(cited)), **PAPER_MARK)
     set_rows(axes, [*map(branch_name, rows), *cited])
     set_axis(axes, "x", "milliseconds (logarithmic)", log=True)

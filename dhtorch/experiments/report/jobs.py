@@ -30,7 +30,7 @@ from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import add_legend, assign_strokes, make_figure, save_figure, set_axis, set_title
 from dhtorch.viz.plots.colours import INK
-from dhtorch.viz.plots.figures import set_rows
+from dhtorch.viz.plots.figures import draw_rows, set_rows
 
 #: Settings that do not distinguish jobs.
 _IGNORED_SETTINGS = ("output", "resume", "traceback", "figures", "workers", "threads", "launch")
@@ -225,9 +225,7 @@ def sweep_figure(results: Sequence[Result]) -> Figure | None:
         )
         set_title(axes, metric_heading(metric) + ", %" * percent)
         if column is None:
-            low, value, high = np.array(ends, float).T
-            axes.hlines(range(len(rows)), low, high, color=INK, linewidth=1.8)
-            axes.plot(value, range(len(rows)), "o", color=INK)
+            draw_rows(axes, ends, [INK] * len(rows))
             set_rows(axes, list(curves))
             set_axis(axes, "x", **of_depth)
             continue

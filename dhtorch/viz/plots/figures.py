@@ -61,6 +61,13 @@ def set_axis(
         getattr(axes, f"set_{name}lim")(*limits)
 
 
+def draw_rows(axes: Any, intervals: Sequence[Sequence[float | None]], colours: Sequence[str]) -> None:
+    """Intervals (low, value, high) in rows 0, 1, …, with dots at the values; what is None is left out."""
+    low, value, high = np.array(intervals, float).reshape(-1, 3).T
+    axes.hlines(range(len(colours)), low, high, color=colours, linewidth=1.8)
+    axes.scatter(value, range(len(colours)), s=36, color=colours, zorder=2.5)
+
+
 def set_rows(axes: Any, names: Sequence[str]) -> None:
     """Named rows 0, 1, … from the top, in place of a y axis."""
     axes.set_yticks(range(len(names)), [shorten(name, 40) for name in names])

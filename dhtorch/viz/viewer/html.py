@@ -7,6 +7,7 @@ Names from files are untrusted: they are embedded as JSON text with markup chara
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
 from dhtorch.viz.plots.colours import CAUSE_COLOURS, GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
 from dhtorch.viz.plots.markup import Markup, build_style_sheet, encode_png_uri, escape_html, make_tag
-from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PageOpening, PairExhibit, PointCloud
+from dhtorch.viz.viewer.exhibit import Exhibit, PageOpening, PairExhibit, PointCloud
 
 HTML_SUFFIXES = (".html", ".htm")
 
@@ -52,21 +53,17 @@ def build_viewer_page(scene: Exhibit) -> str:
     if not scene.shots:
         raise ValueError(f"view: found no pair in {scene.name}, expected at least one")
     text = storage.dump_strict_json(_encode_exhibit(scene), ensure_ascii=True, separators=(",", ":"))
+    opening, poster = _format_opening(scene.opening)
     parts = {
         "title": escape_html(f"{scene.name} · dhtorch"),
         "style": build_style_sheet(_FOLDER / "page.css"),
-        "opening": _format_opening(scene.opening) if scene.opening is not None else "",
-        "poster": _format_poster(scene.opening) if scene.opening is not None else "",
+        "opening": opening,
+        "poster": poster,
         # "</script" and "<!--" must not occur in a script; in JSON strings an escape is equivalent.
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": "\n".join(_read_asset(name) for name in _SCRIPTS),
     }
-    skeleton = _read_asset("page.html").split("{{")
-    pieces = [skeleton[0]]
-    for piece in skeleton[1:]:
-        name, rest = piece.split("}}", 1)
-        pieces += [parts[name], rest]
-    return "".join(pieces)
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _read_asset("page.html"))
 
 
 def write_viewer_page(path: Path, scene: Exhibit) -> Path:
@@ -79,23 +76,19 @@ def write_viewer_page(path: Path, scene: Exhibit) -> Path:
     return storage.replace_file(path, build_viewer_page(scene).encode("utf-8"))
 
 
-def _format_opening(opening: PageOpening) -> Markup:
-    """Opening -> markup: numbers and sentences, above the 3D view."""
-    numbers = (
-        make_tag("div", make_tag("dt", what), make_tag("dd", amount)) for what, amount in opening.numbers.items()
-    )
+def _format_opening(opening: PageOpening | None) -> tuple[Markup | str, Markup | str]:
+    """Opening -> markup of its numbers and sentences, above the 3D view, and of its image, below; empty without one."""
+    if opening is None:
+        return "", ""
+    numbers = (make_tag("div", make_tag("dt", name), make_tag("dd", value)) for name, value in opening.numbers.items())
     parts = [make_tag("dl", *numbers, class_="numbers"), *(make_tag("p", text) for text in opening.sentences)]
-    return make_tag("section", *parts, id="opening", aria_label="What was recovered")
-
-
-def _format_poster(opening: PageOpening) -> Markup | str:
-    """Opening -> markup of its image, below the 3D view; empty without one."""
+    above = make_tag("section", *parts, id="opening", aria_label="What was recovered")
     if opening.picture is None:
-        return ""
-    shown = make_tag("img", alt=opening.caption, src=encode_png_uri(opening.picture))
+        return above, ""
+    image = make_tag("img", alt=opening.caption, src=encode_png_uri(opening.picture))
     below = make_tag("figcaption", opening.caption) if opening.caption else ""
-    figure = make_tag("figure", make_tag("div", shown, class_="scroll", tabindex="0"), below)
-    return make_tag("section", figure, id="poster", aria_label="A frame and its depth")
+    figure = make_tag("figure", make_tag("div", image, class_="scroll", tabindex="0"), below)
+    return above, make_tag("section", figure, id="poster", aria_label="A frame and its depth")
 
 
 def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
@@ -123,7 +116,13 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
         "holes": [_describe_code(code, name, HOLE_COLOURS) for code, name in names(Hole).items() if code != Hole.NONE],
         "causes": [_describe_code(code, name, CAUSE_COLOURS) for code, name in names(Cause).items() if code],
         "outcomes": [{"key": key, "name": name, "colour": colour} for key, name, colour in outcomes],
-        "views": [_encode_view(view) for view in scene.views],
+        "views": [
+            {
+                **{name: getattr(view, name) for name in ("number", "time", "hw", "f", "c")},
+                "jpeg": base64.b64encode(view.jpeg).decode("ascii"),
+            }
+            for view in scene.views
+        ],
         "shots": [_encode_pair(shot) for shot in scene.shots],
         "path": None if scene.path is None else _encode_array(scene.path, "f4"),
     }
@@ -156,11 +155,6 @@ def _encode_pair(shot: PairExhibit) -> dict[str, Any]:
     }
     poses = {"T_world_from_0": shot.T_world_from_0, "T_world_from_1": shot.T_world_from_1}
     return encoded | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
-
-
-def _encode_view(view: ExhibitView) -> dict[str, Any]:
-    facts = {"number": view.number, "time": view.time, "hw": list(view.hw), "f": list(view.f), "c": list(view.c)}
-    return facts | {"jpeg": base64.b64encode(view.jpeg).decode("ascii")}
 
 
 def _encode_cloud(cloud: PointCloud) -> dict[str, Any]:
