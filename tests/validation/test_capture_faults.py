@@ -56,7 +56,7 @@ def test_numbers_of_the_summary():
     rows = [row("none", "right"), row("none", "alarm"), row("lag_1", "named"), row("lag_1", "silent", False)]
     rows += [row("w2c", "otherwise"), row("w2c", "refused"), row("w2c", "right")]
     summary = capture_faults.summarise(rows)
-    assert summary["outcomes"] == {"right": 1, "refused": 1, "named": 1, "otherwise": 1, "silent": 1}
+    assert summary["outcomes"] == {"right": 1, "refused": 1, "named": 1, "otherwise": 1, "silent": 1, "unchecked": 0}
     assert summary["n_counted"] == 4 and summary["named_rightly"] == 3 / 4
     assert summary["false_alarms"] == 1 / 2 and summary["n_sound"] == 2
 
