@@ -75,7 +75,7 @@ def test_the_tables_of_an_experiment_are_those_that_are_stored(name):
         assert not table.over or sum(span for _, span in table.over) == len(table.head)
 
 
-@pytest.mark.parametrize("name", layouts.EXPERIMENT_LAYOUTS.keys() & set(NAMES))
+@pytest.mark.parametrize("name", sorted(layouts.EXPERIMENT_LAYOUTS.keys() & set(NAMES)))
 @pytest.mark.parametrize("one_scene", [False, True])
 def test_the_console_prints_every_figure_of_the_paper_also_for_one_scene(name, one_scene, capsys):
     result = results()[name]
