@@ -8,29 +8,23 @@ from typing import Any
 
 from cells import percent, read, table
 
-from dhtorch.pipeline.presets import METHODS
 from dhtorch.runtime.console import format_count
 
 #: Uses of a given pose, in words.
-USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined": "`refine=True`"}
+USED = {"as it is": "as it is", "refined": "`refine=True`"}
 
 
-def given_poses(method: str) -> str:
-    """What is answered under right poses of every capture, by what is made of them, beside near returns alone.
-
-    Columns of sigma are those of a method that states one.
-    """
-    ends = ("near returns", "as it is", "refined") if METHODS[method].states_sigma else ()
+def given_poses() -> str:
+    """What ``map`` answers under right poses of every capture, by what is made of them, beside near returns alone."""
     rows = []
-    for scene, runs in by_capture(method).items():
+    for scene, runs in by_capture("map").items():
         right = {row["use"]: row for row in runs if row["pose"] in ("right", "none")}
         name = f"`{scene}`" + (" (turns only)" if runs[0]["role"] == "rotation" else "")
         uses = [right["near returns"], *(right[use] for use in USED)]
-        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
-        honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
-        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest[: len(ends)]])
-    head = [f"{first}: near returns / {' / '.join(USED.values())}" for first in ("answered", "median error")]
-    return table(["capture", "held back", *head, *(f"within 1, 2 sigma: {end}" for end in ends)], rows)
+        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel", "within_2sigma")]
+        rows.append([name, str(right["near returns"]["n_candidates"]), *cells])
+    head = f"near returns / {' / '.join(USED.values())}"
+    return table(["capture", "held back", f"answered: {head}", "median error", "within 2 sigma"], rows)
 
 
 def misread_poses(method: str) -> str:
@@ -100,9 +94,7 @@ def rig_poses() -> str:
     for row in rigs("pose"):
         several = row.get("all", [row])
         head = [row["rig"], row["tracker"], f"{row['n_ok']:g} of {row['n_instants']:g}"]
-        if row.get("baseline_m") is None:
-            reached = ", ".join(code.lower().replace("_", " ") for code in row["codes"])
-            rows.append([*head, f"– / {1e3 * row['calibrated_m']:.1f}", "", "", f"none: {reached}"])
+        if row.get("baseline_m") is None:  # no pose at any instant
             continue
         off = f"{row['off_deg']:.3f}°, {1e3 * row['off_m']:.2f} mm"
         stated = f"{row['sigma_deg']:.3f}°, {1e3 * row['sigma_m']:.2f} mm"
@@ -116,7 +108,7 @@ def rig_poses() -> str:
 def rig_answers() -> str:
     """What pairs of cameras answer, by where their pose comes from."""
     rows = []
-    for row in rigs("answers"):
+    for row in (r for r in rigs("answers") if r["coverage"]):
         n = row["n_candidates"]
         cells = [row["rig"], row["tracker"], row["pairs"], row["pose"], f"{n:g}", percent(row["coverage"])]
         cells += [percent(row["median_rel"]), percent(row["p90_rel"])]
@@ -126,25 +118,15 @@ def rig_answers() -> str:
 
 
 def upwards() -> str:
-    """Which way is up in every capture: stated, shown by its surfaces, written."""
+    """Which way is up in captures that show a level surface: stated, shown by it, written."""
     rows = []
-    for row in read("gravity"):
-        stated, why = row.get("stated"), row.get("why", "")
-        if "format" not in row:
-            rows.append([f"`{row['capture']}`", "", "", "", "", "", f"not opened: {why.partition(': ')[2]}"])
-            continue
+    for row in (r for r in read("gravity") if "plane" in r):
+        stated = row.get("stated")
         axis = "–" if stated is None else "xyz"[max(range(3), key=lambda k: abs(stated[k]))]
         sign = "" if stated is None else "−" if sum(stated) < 0 else "+"
-        plane = f"{percent(row['share'])} of the area" if "plane" in row else "–"
-        cells = [f"`{row['capture']}`", row["format"], sign + axis, plane]
-        cells += [degrees(row.get(key)) for key in ("stated_from_plane_deg", "written_from_plane_deg")]
-        if "largest_from_stated_deg" in row and "plane" not in row:
-            why = f"{why}; the largest one is {degrees(row['largest_from_stated_deg'])} from the stated axis"
-        if row.get("written") is None:
-            why = "; ".join(filter(None, (why, "no map is written")))
-        rows.append([*cells, why])
-    head = ["capture", "format", "stated", "level surface", "stated axis from it", "`up` in the files from it", ""]
-    return table(head, rows)
+        angles = (degrees(row.get(key)) for key in ("stated_from_plane_deg", "written_from_plane_deg"))
+        rows.append([f"`{row['capture']}`", sign + axis, percent(row["share"]), *angles])
+    return table(["capture", "stated", "level area", "stated axis from it", "`up` in the files from it"], rows)
 
 
 def degrees(value: float | None) -> str:
@@ -152,6 +134,5 @@ def degrees(value: float | None) -> str:
     return "–" if value is None else f"{value:.1f}°"
 
 
-TABLES = {f"given poses {method}": partial(given_poses, method) for method in ("map", "paper")}
-TABLES |= {"misread poses": partial(misread_poses, "map"), "rig poses": rig_poses, "rig answers": rig_answers}
-TABLES["upwards"] = upwards
+TABLES = {"given poses": given_poses, "misread poses": partial(misread_poses, "map"), "rig poses": rig_poses}
+TABLES |= {"rig answers": rig_answers, "upwards": upwards}

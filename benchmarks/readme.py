@@ -401,19 +401,28 @@ HEAD = {"coverage": "coverage", "median_rel": "median error", "p90_rel": "p90 er
 HEAD |= {"coverage_at_5": "coverage at 5 % risk", "ms": "ms"}
 
 
+#: What ``dhtorch PATH`` prints of recovered pixels.
+RECOVERED = re.compile(r"Recovered ([\d,]+) pixels a frame .*?from (.*?) to (.*?), median stated error ([\d.]+%)")
+
+
 def captures() -> str:
-    """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took; last the phone's."""
-    rows = []
+    """Captures of which ``dhtorch PATH`` recovered something, and how long it took; then the others by name."""
+    rows, others = [], []
     for record in [*read("captures"), *read("phone")]:
         first = "" if record["first_s"] is None else f"{record['first_s']:.0f}"
-        printed = (record.get("printed") or record.get("why") or "").removeprefix(f"{record['name']}: ")
-        rows.append([printed, f"`{record['name']}`", first, f"{record['seconds']:.0f}"])
-    grid = table(["what came out", "capture", "first picture, s", "all, s"], rows)
+        found = RECOVERED.search(record.get("printed") or "")
+        if found is None:
+            others.append(f"`{record['name']}`")
+        else:
+            pixels, near, far, error = found.groups()
+            rows.append([f"`{record['name']}`", pixels, f"{near} to {far}", error, first, f"{record['seconds']:.0f}"])
+    head = ["capture", "recovered pixels a frame", "depths", "median stated error", "first image, s", "all, s"]
     shown = "".join(
-        f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
+        f"\n\n![{file.stem}: image, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
         for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
     )
-    return f"{grid}\n\n{record['processor']}, {record['cores']} cores, beside other work.{shown}"
+    rest = f"Nothing recovered, with a sentence that states why: {', '.join(others)}."
+    return f"{table(head, rows)}\n\n{rest}\n\n{record['processor']}, {record['cores']} cores, beside other work.{shown}"
 
 
 def enriched() -> str:
@@ -606,21 +615,22 @@ def faults_of_captures() -> str:
 
 
 def sensitivities() -> str:
-    """Options whose half or twice value changes coverage or median error most, and those that change neither."""
+    """Options whose half and twice value change neither coverage nor median error, and the strongest others."""
     rows = read("sensitivity")
-    numbers = ("coverage", "median_rel")
-    cells = []
-    for row in rows:
-        shown = [
-            " / ".join(
-                "–" if row[at].get(x) is None or row[at][x] != row[at][x] else f"{row[at][x]:.3f}"
-                for at in ("half", "as_is", "twice")
-            )
-            for x in numbers
-        ]
-        cells.append([f"`{row['name']}`", f"{row['value']:g}", *shown, "yes" if row["candidate_for_removal"] else ""])
-    head = ["option", "value", "coverage at half / value / twice", "median error", "changes nothing"]
-    return table(head, cells)
+    idle = ", ".join(f"`{row['name']}`" for row in rows if row["candidate_for_removal"])
+
+    def reach(row: dict[str, Any], number: str) -> float:
+        values = [row[at].get(number) for at in ("half", "as_is", "twice")]
+        some = [value for value in values if value is not None and value == value]
+        return max(some) - min(some)
+
+    strong = sorted(rows, key=lambda row: -reach(row, "coverage"))[:8]
+    cells = [
+        [f"`{row['name']}`", f"{row['value']:g}", *(f"{reach(row, x):.3f}" for x in ("coverage", "median_rel"))]
+        for row in strong
+    ]
+    head = ["option", "value", "coverage, range", "median error, range"]
+    return f"{table(head, cells)}\n\nNeither number moves by more than 0.002 with {idle}."
 
 
 TABLES: dict[str, Callable[[], str]] = {"comparison": comparison}
