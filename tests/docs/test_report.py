@@ -473,3 +473,12 @@ def test_the_console_takes_names_literally():
     report.print_tables(result, Console(file=out))
     assert "hall [a]|b" in out.getvalue() and "…" not in out.getvalue()
     assert "hall [a]\\|b" in report.to_markdown(result)
+
+
+def test_the_console_shows_summaries_bold_intervals_dim_and_the_paper_s_lines_in_a_colour():
+    out = io.StringIO()
+    report.print_tables(results()["heldout"], Console(file=out, force_terminal=True, width=240))
+    kinds = {"\x1b[33m": "published: ", "\x1b[2m": "95 % interval", "\x1b[1m": " scenes ", "": "kitchen_000"}
+    for style, start in kinds.items():
+        lines = [line for line in out.getvalue().splitlines() if start in re.sub("\x1b.*?m", "", line)[:20]]
+        assert lines and all((style in line) if style else ("\x1b" not in line) for line in lines), start
