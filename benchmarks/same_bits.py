@@ -366,7 +366,10 @@ def map_items(case: Case, quick: bool) -> list[Item]:
     items: list[Item] = [
         (f"{name} complete, pair", lambda: completed(case, "map", case.other, **steps)),
         (f"{name} complete, views", lambda: completed(case, "auto", case.between, **steps)),
-        (f"{name} complete, sensor alone", lambda: call(resolve("sensor_depth_map"), case.view, size=size)),
+        (
+            f"{name} complete, sensor alone",
+            lambda: call(resolve("sensor_depth_map"), case.view, size=size, method=method("map")),
+        ),
     ]
     kinds = range(5) if case.name == "room" or (case.name.startswith(MAP_SCENES[0]) and not quick) else range(1)
     items += [(f"{name} align, kind {k + 1}", partial(aligned, case, k)) for k in kinds]
