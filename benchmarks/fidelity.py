@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import reproduce
 from cells import read
 from cells import table as markdown
 
@@ -106,12 +105,6 @@ def table() -> str:
     """The page's table, in Markdown."""
     head = ["paper", "line", "figure", "paper", "here", "95 % interval", "n", "deviation", "file"]
     return markdown(head, list(_cells()), n_label=3)
-
-
-def commands() -> str:
-    """The commands of the files in the table, in Markdown."""
-    names = dict.fromkeys(finding.result for finding in FINDINGS)
-    return "\n".join(f"- `{name}.json`: `dhtorch {reproduce.EXPERIMENTS[name]}`" for name in names)
 
 
 def _cells() -> Iterator[list[str]]:

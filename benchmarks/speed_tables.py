@@ -107,21 +107,6 @@ def bars() -> str:
     return table(head, rows)
 
 
-def stages() -> str:
-    """Milliseconds per pair by stage, one thread, compiled operators."""
-    shown = []
-    rows = {r["name"]: r for r in timings("pair") if (r["threads"], r["mode"]) == (1, "compiled")}
-    for batch in (1, 8):
-        for stage in ("", ".track", ".pose", ".triangulate"):
-            cells = [f"B = {batch}, {stage[1:] or 'whole pair'}"]
-            for method in ("paper", "map"):
-                r = rows[f"pair_{method}_b{batch}{stage}"]
-                cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
-            shown.append([*cells, f"{r['peer_ms']:.1f}"])
-    head = ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"]
-    return on("pair", table(head, shown))
-
-
 def scaling() -> str:
     """Growth exponents, and the memory of the largest size."""
     rows = []

@@ -255,6 +255,7 @@ def choices(group: str) -> str:
     for file in sorted((REPO / "conf" / group).glob("*.yaml")):
         lines = file.read_text(encoding="utf-8").splitlines()
         words = [line[1:].strip() for line in lines[: next(i for i, x in enumerate(lines) if not x.startswith("#"))]]
+        words = [line for line in words if not line.startswith("Written from its record")]
         rows.append(f"| `{file.stem}` | {' '.join(words)} |")
     return "\n".join(rows)
 
