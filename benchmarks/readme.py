@@ -425,22 +425,21 @@ def captures() -> str:
 
 
 def enriched() -> str:
-    """Formats that ``dhtorch enrich`` wrote of each kind of source, read back value for value, and those it refuses."""
+    """Sets that ``dhtorch enrich`` wrote of real and of written sources, read back value for value; what it refuses."""
     records = read("enrich")
     targets = ("lerobot v3.0", "lerobot v2.1", "nerfstudio", "the source's own")
     rows = []
-    for source in sorted({record["source"] for record in records}):
-        of_source = [record for record in records if record["source"] == source]
+    for origin in ("real", "written"):
+        of_origin = [r for r in records if (r["origin"] == "real") == (origin == "real")]
         cells = []
         for target in targets:
-            of_target = [record for record in of_source if record["target"] == target]
-            written = [r for r in of_target if "refused" not in r]
+            written = [r for r in of_origin if r["target"] == target and "refused" not in r]
             equal = sum(bool(r["source_untouched"] and r["done_again"] and r["compared"]) for r in written)
-            cells.append(f"{equal} of {len(of_target)}" if written else "refused")
-        times = [record["s_per_frame"] for record in of_source if "refused" not in record]
-        is_real = any(record["origin"] == "real" for record in of_source)
-        rows.append([f"`{source}`", "real" if is_real else "written", *cells, f"{min(times):.2f} to {max(times):.2f}"])
-    return table(["source", "data", *targets, "s a frame"], rows)
+            cells.append(f"{equal} of {len(written)}")
+        times = [r["s_per_frame"] for r in of_origin if "refused" not in r]
+        sources = ", ".join(f"`{source}`" for source in sorted({r["source"] for r in of_origin}))
+        rows.append([f"{origin}: {sources}", *cells, f"{min(times):.2f} to {max(times):.2f}"])
+    return table(["sources", *targets, "s a frame"], rows)
 
 
 #: What validation is to find, in words, and its bars.
@@ -606,11 +605,13 @@ def faults_of_captures() -> str:
     rows = [row for row in read("capture_faults") if row["counted"]]
     kinds = {"right": "read right", "refused": "refused", "named": "named", "otherwise": "other warning"}
     kinds |= {"unchecked": "stated as unchecked", "silent": "not detected", "alarm": "false alarm"}
-    cells = []
+    faults: dict[tuple[str, ...], list[str]] = {}
     for fault in dict.fromkeys(row["fault"] for row in rows):
         outcomes = [row["outcome"] for row in rows if row["fault"] == fault]
-        cells.append([f"`{fault}`", str(len(outcomes)), *(str(outcomes.count(kind) or "") for kind in kinds)])
-    return table(["fault", "captures", *kinds.values()], cells)
+        counts = (str(len(outcomes)), *(str(outcomes.count(kind) or "") for kind in kinds))
+        faults.setdefault(counts, []).append(f"`{fault}`")
+    cells = [[", ".join(names), *counts] for counts, names in faults.items()]
+    return table(["faults, of each", "captures", *kinds.values()], cells)
 
 
 def sensitivities() -> str:

@@ -155,7 +155,7 @@ def accelerator() -> str:
     by_name: dict[tuple[str, str], dict[str, Any]] = {(r["name"], r["mode"]): r for r in timings("gpu")}
     rows = []
     for (name, mode), r in by_name.items():
-        if mode != "eager" or r["peer"] == "kornia":
+        if mode != "eager" or r["peer"] == "kornia" or r["batch"] not in (1, 64) or "kornia" in name:
             continue
         graph, kornia = by_name.get((name, "graph")), by_name.get((f"{name}.kornia", "eager"))
         others = [

@@ -343,9 +343,7 @@ def colours() -> str:
     maps |= {"error": palette.ERROR_CMAP, "signed difference": palette.SIGNED_CMAP, "picture": palette.GREY_CMAP}
     rows = [f"| {name} | `{kind}` | {_ramp(palette.sample_cmap(kind, 33))} |" for name, kind in maps.items()]
     parts.append("\n".join(["## Colour maps, from small to large", "", "| | | |", "| :-- | :-- | :-- |", *rows]))
-    pages = [f"| `{name}` | {_patch(day)} | {_patch(dark)} |" for name, (day, dark) in palette.PAGE_COLOURS.items()]
-    head = ["## Variables of a page", "", "| | by day | in the dark |", "| :-- | :-- | :-- |"]
-    return "\n\n".join([*parts, "\n".join([*head, *pages])])
+    return "\n\n".join(parts)
 
 
 def _patches(title: str, table: Mapping[str, str]) -> str:
