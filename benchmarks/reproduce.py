@@ -374,13 +374,14 @@ def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
     rows += [{k: v for k, v in row.items() if k in of_pair} for row in some_pairs]
     for row in rows:
         if "curves" in row:
-            row["curves"] = {"risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk")}}
+            row["curves"] = {"risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk", "oracle")}}
     summary = {k: v for k, v in result["summary"].items() if not left_out & set(k.split("."))}
     return {**result, "rows": rows, "summary": summary}
 
 
-def run(name: str, further: str = "", target: Path = RESULTS) -> bool:
+def run(name: str, further: str = "", target: Path | None = None) -> bool:
     """Make one result file with further options; whether that went well."""
+    target, is_committed = target or RESULTS, target is None
     path = target / f"{name}.json"
     print(f"== {command(name)} {further}", flush=True)
     if name in SCRIPTS:
@@ -398,7 +399,7 @@ def run(name: str, further: str = "", target: Path = RESULTS) -> bool:
             if done.returncode == 0:
                 result = result_files.read_result(Path(folder) / "result.json")
                 result_files.write_result(path, without_detail(result))
-    if done.returncode == 0 and target == RESULTS:
+    if done.returncode == 0 and is_committed:
         note(name)
     return done.returncode == 0
 

@@ -48,7 +48,7 @@ def test_a_result_is_committed_without_what_no_page_reads():
     kept = {k: v for k, v in scene.items() if k not in ("overlay", "curves", "ms")}
     assert reproduce.without_detail(whole) == {**whole, "rows": [kept], "summary": {"map.coverage": 1}}
     compared = reproduce.without_detail({**whole, "experiment": "method_comparison"})["rows"]
-    assert compared == [{**kept, "ms": {}, "curves": {"risk_coverage": {"coverage": [1], "risk": [2]}}}]
+    assert compared == [{**kept, "ms": {}, "curves": {"risk_coverage": {"coverage": [1], "risk": [2], "oracle": [3]}}}]
     validated = reproduce.without_detail({**whole, "experiment": "validate_study"})["rows"]
     assert validated == [kept, {k: v for k, v in pair.items() if k != "coverage"}]
 

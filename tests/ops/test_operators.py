@@ -801,7 +801,6 @@ LIMITS = [
     ("fits", plane_sweep, "WINDOW_GAIN_RANGE", (0.9, 1.1)),
     ("fits", plane_sweep, "FLAT_VARIANCE", 1e-2),
     ("fits", plane_sweep, "FLAT_GRADIENT_VARIANCE", 1.0),
-    ("occlusions", surface, "MIN_SQUARED_MOTION", 1.0),
     ("search", lk, "AITKEN_RATIO_RANGE", (0.0, 0.1)),
     ("search, gain", lk, "CONTRAST_RATIO_RANGE", (0.95, 1.05)),
     ("registration", affine_alignment, "AFFINE_DAMPING", 0.1),

@@ -316,7 +316,7 @@ def test_a_bad_row_of_a_batch_is_zero_and_the_others_stay():
         extender({k: v for k, v in given.items() if k != "depth"})
 
 
-NAMES = r"method is 'mapp', expected one of \['auto', 'fused', 'kornia', 'map', 'paper', 'window'\] or a Method"
+NAMES = r"method is 'mapp', expected one of \['auto', 'fused', 'kornia', 'map', 'paper'\] or a Method"
 
 
 @pytest.mark.parametrize(
