@@ -374,7 +374,9 @@ def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
     rows += [{k: v for k, v in row.items() if k in of_pair} for row in some_pairs]
     for row in rows:
         if "curves" in row:
-            row["curves"] = {"risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk", "oracle")}}
+            row["curves"] = {
+                "risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk", "oracle")}
+            }
     summary = {k: v for k, v in result["summary"].items() if not left_out & set(k.split("."))}
     return {**result, "rows": rows, "summary": summary}
 

@@ -5,14 +5,15 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import all_known
+from dhtorch.geometry.checks import all_known, is_transformed
+from dhtorch.geometry.least_squares import has_graph
 from dhtorch.pipeline.inputs import EXPECTED_IMAGE, dtype_name
 from dhtorch.records import Camera
 
@@ -222,6 +223,21 @@ class SampleReader:
                 f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
             )
         return x
+
+    def fingerprint(self, numbers: KeyOrCamera) -> Hashable | None:
+        """Numbers -> cache key of the tensors read from them; None if they cannot be cached.
+
+        These are numbers with a graph, on another device or of a type unknown to numpy, and all in inference mode,
+        whose tensors cannot be used outside it.
+        """
+        value = get_value(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
+        if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
+            value = value.numpy() if value.is_cpu and not has_graph(value) else value
+        is_plain = isinstance(value, np.ndarray) and value.dtype.kind in "buif"
+        if not is_plain or self.like is None or torch.is_inference_mode_enabled():
+            return None
+        digest = value.tobytes(), value.dtype.str, value.shape
+        return digest, self.dtype, self.like.device, self.batched, len(self.like)
 
     def camera(
         self, numbers: KeyOrCamera, T: int, at: int, distortion: Tensor | None, checks: list[Any] | None = None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -116,6 +116,8 @@ class SampleSpec:
     max_depth: float = 100.0  # m, a larger median depth means a wrong unit
     min_depth: float = 0.01  # m, a smaller median depth means a wrong unit
     min_focal: float = 0.05  # smaller focal lengths, as a fraction of the longer image side, are of another unit
+
+    _cameras: dict[Any, Camera] = field(default_factory=dict, init=False, repr=False, compare=False)  # read before
 
     def __post_init__(self) -> None:
         unit = self.depth_unit
@@ -330,12 +332,18 @@ class SampleSpec:
     def _camera(
         self, leaves: SampleReader, numbers: KeyOrCamera, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
+        digest = None if self.distortion is not None else leaves.fingerprint(numbers)
+        key = (digest, hw, T, at)
+        if digest is not None and key in self._cameras:
+            return self._cameras[key]
         failed: list[Any] = []
         camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at), failed)
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         least = self.min_focal * max(hw)
         if not failed and _is_clearly_plausible(camera, least):
+            if digest is not None and len(self._cameras) < 64:  # a recording has one camera, or one for each frame
+                self._cameras[key] = camera
             return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
         small, centre = camera.f.detach().amin(-1), camera.c.detach().sum(-1)

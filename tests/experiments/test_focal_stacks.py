@@ -310,7 +310,11 @@ IMAGES = {"format": "images"}
         (fod, {"focus_m": FOCUS[:4]}, r"samples: found none complete among 1, expected 4 \*All.tif and one \*Dpt.exr"),
         (fod, {"f_number": 0}, r"option f_number: found 0.0, expected a positive number"),
         (fod, {"max_depth": -1}, r"option max_depth: found -1.0"),
-        (lambda root: (fod(root), cut(root / "000000Dpt.exr", -20)), {}, r"000000Dpt.exr: data: found scan lines missing"),
+        (
+            lambda root: (fod(root), cut(root / "000000Dpt.exr", -20)),
+            {},
+            r"000000Dpt.exr: data: found scan lines missing",
+        ),
         (fod_of_other_size, {}, r"000000_03All.tif: picture: found 17x12"),
         (
             lambda root: hdf5_file(root, stack_train=PIXELS, disp_train=np.ones((2, 12, 16))),

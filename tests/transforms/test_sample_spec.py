@@ -510,6 +510,24 @@ def test_numbers_that_are_looked_at_are_judged_as_by_operations(monkeypatch):
 # -------------------------------------------------------------------------------------------------------------- cameras
 
 
+def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
+    views = SampleSpec(depth_unit="m")
+    given = [matrix(*K), matrix(21, 22, 3.5, 2.5), matrix(*K).astype(np.float64), torch.tensor(matrix(*K)), [*K]]
+    given += [torch.tensor(K, dtype=torch.bfloat16), matrix(*K)[::-1], np.array(K, np.int64)]
+    for value in (*given, *given):
+        found, alone = (spec.read(sample(intrinsics=value)) for spec in (views, SampleSpec(depth_unit="m")))
+        assert torch.equal(numbers(found.reference.camera), numbers(alone.reference.camera))
+        assert torch.equal(found.bad, alone.bad)
+    assert views.read(sample()).reference.camera is views.read(sample()).reference.camera
+    for k in range(200):  # one for each frame: never more than some are kept
+        views.read(sample(intrinsics=matrix(20 + k / 100, *K[1:])))
+    assert len(views._cameras) <= 64 and SampleSpec(depth_unit="m") == views
+    views = SampleSpec(depth_unit="m")
+    with torch.inference_mode():
+        views.read(sample())
+    assert not views.read(sample()).reference.camera.f.is_inference(), "a graph could not go through it"
+
+
 @pytest.mark.parametrize("T", [3, 4])
 def test_numbers_along_time_are_those_of_the_frame(T):
     """Also four rows of four numbers: of four frames, unless they end in 0 0 0 1."""
