@@ -34,6 +34,7 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.compare import dense_comparison
 from dhtorch.experiments.compare_methods import MIN_ANSWERS_ABOVE_THRESHOLD as FEW
 from dhtorch.metrics import calibration, control
+from dhtorch.metrics.calibration import fitting
 from dhtorch.metrics.errors import Points
 
 #: Reference views of every scene whose maps the calibration of joint answers is fitted on.
@@ -100,7 +101,7 @@ def main() -> int:
         if method.views == 1
         else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
     )
-    fitted = calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
+    fitted = fitting.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
     real = [points for name, points in pooled.items() if not name.startswith("synthetic")]
     fitted = replace(fitted, sigma=calibration.fit_sigma_model(real))
     target = options.output or HERE.parent / "dhtorch" / "metrics" / "calibration" / f"{options.method}.json"

@@ -771,7 +771,7 @@ ELSEWHERE = {
     *(
         f"dhtorch.metrics.calibration.{name}"
         for name in (
-            *("fit_calibration", "fit_sigma_model", "parse_calibration"),
+            "parse_calibration",
             *("list_calibrations", "load_calibration", "load_probability", "save_calibration"),
         )
     ),

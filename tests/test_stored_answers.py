@@ -24,7 +24,7 @@ from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.integrate import DepthView, extract_mesh, extract_points, fuse_views, make_volume
 from dhtorch.measure import metric_scale
 from dhtorch.metrics import errors, reliability, risk
-from dhtorch.metrics.calibration import fit_calibration
+from dhtorch.metrics.calibration.fitting import fit_calibration
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER
 from dhtorch.pytree import collate, stack

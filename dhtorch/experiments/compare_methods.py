@@ -18,7 +18,8 @@ import torch
 from dhtorch import pytree
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
-from dhtorch.metrics.calibration import fit_calibration, list_calibrations, load_calibration
+from dhtorch.metrics.calibration import list_calibrations, load_calibration
+from dhtorch.metrics.calibration.fitting import fit_calibration
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.uncertainty import interval_coverage, measure_uncertainty, range_bias
 

@@ -7,7 +7,7 @@ Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -236,10 +236,9 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     Source: P. Huber, "Robust Statistics", 1981, section 7.6; of the blocks H. Künsch, "The jackknife and the bootstrap
     for general stationary observations", 1989, with a linear step in place of a new solution.
     """
-    parts = cache(partial(_sandwich_parts, problem, solution, o))
 
     def sums() -> tuple[Tensor, Tensor]:
-        _, rows, _, *weights = parts()
+        _, rows, _, *weights = _sandwich_parts(problem, solution, o)
         bread, meat = (normal_equations(rows, weight.double(), block=SUM_LANES)[0] for weight in weights)
         return bread, meat
 
@@ -259,7 +258,7 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     whole = small_matmul(small_matmul(inverse, M), inverse)
     whole = 0.5 * (whole + whole.transpose(1, 2))
     if o.blocks is not None:
-        front, rows, weight, bread, _ = parts()
+        front, rows, weight, bread, _ = _sandwich_parts(problem, solution, o)
         blocks = _blocks_of(problem.ray, problem.near & front, *o.blocks)
         steps = _steps_without_blocks(rows, bread, weight, blocks, solution)
         # Covariance of the delete-block jackknife over the stated one, (B,) and at least 1: mean over the

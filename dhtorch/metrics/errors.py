@@ -14,11 +14,15 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.metrics import bootstrap
+from dhtorch.metrics.bootstrap import Interval, interval_over_scenes
 from dhtorch.metrics.correlation import pearson
 from dhtorch.metrics.holdout import Truth
 from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate
+
+#: Relative error below which an answer is good.
+GOOD_ERROR_REL = 0.1
+
 
 #: Metric name → value, None where undefined.
 MetricValues = dict[str, float | None]
@@ -166,9 +170,9 @@ def summarise_scenes(
         values = [scene.get(name) for scene in flat]
         if name.startswith("n_"):
             defined = [v for v in values if v is not None]
-            interval = bootstrap.Interval(sum(defined) if defined else None, None, None, len(defined))
+            interval = Interval(sum(defined) if defined else None, None, None, len(defined))
         else:
-            interval = bootstrap.interval_over_scenes(values, statistic=statistic, draws=draws, seed=seed)
+            interval = interval_over_scenes(values, statistic=statistic, draws=draws, seed=seed)
         summary[name] = interval.entry(metric_unit(name))
     return summary
 

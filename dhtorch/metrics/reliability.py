@@ -11,12 +11,9 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.metrics import bootstrap
-from dhtorch.metrics.errors import MetricValues, Points
+from dhtorch.metrics.bootstrap import Interval, interval_of_statistic
+from dhtorch.metrics.errors import GOOD_ERROR_REL, MetricValues, Points
 from dhtorch.pytree import Record, record
-
-#: Relative error below which an answer is good.
-GOOD_ERROR_REL = 0.1
 
 
 @record
@@ -126,17 +123,17 @@ def measure_reliability(scenes: Sequence[Points], *, bins: int = 10) -> MetricVa
     }
 
 
-def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
+def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> Interval:
     """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are ignored."""
     tables = [reliability_diagram(*pool_answers([s]), bins=bins) for s in scenes if bool(s.keep.any())]
     if not tables:
-        return bootstrap.Interval(None, None, None, 0)
+        return Interval(None, None, None, 0)
     gaps = torch.stack([(t.weight * (t.claimed - t.realised)).nan_to_num() for t in tables])
 
     def ece(index: Tensor) -> Tensor:
         return gaps[index].mean(1).abs().sum(-1)
 
-    return bootstrap.interval_of_statistic(ece, len(tables), draws=draws, seed=seed)
+    return interval_of_statistic(ece, len(tables), draws=draws, seed=seed)
 
 
 def leave_one_room_out(

@@ -9,7 +9,8 @@ import torch
 
 from dhtorch import pytree
 from dhtorch.experiments import compare_methods as compare
-from dhtorch.metrics import bootstrap, calibration, control, errors, reliability, risk
+from dhtorch.metrics import bootstrap, control, errors, reliability, risk
+from dhtorch.metrics.calibration.fitting import fit_calibration
 
 
 def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
@@ -82,7 +83,7 @@ def test_promises_equal_plain_loops():
     for scene, row in zip("abcd", found.rows, strict=True):
         others = [joined[s] for s in "abcd" if room.get(s, s) != room.get(scene, scene)]
         nine_in_ten = functools.partial(control.scene_quantile_threshold, few=100 * len(ours[scene]))
-        learnt = calibration.fit_calibration(others, targets=(10, 5), choose=nine_in_ten)
+        learnt = fit_calibration(others, targets=(10, 5), choose=nine_in_ten)
         applied[scene] = learnt.apply(joined[scene])
         claimed = learnt.sigmoid(joined[scene].score)
         sigmoid[scene] = joined[scene].replace(score=torch.where(joined[scene].keep, claimed, 0.0))

@@ -106,7 +106,7 @@ def test_a_killed_driver_resumes_with_another_engine(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.wait(120) == 130, (tmp_path / "err").read_text()
     err = (tmp_path / "err").read_text()
-    assert 2 <= there < ROWS // EACH and "whole and stay" in err and "Traceback" not in err, err
+    assert 2 <= there < ROWS // EACH and "complete and stay" in err and "Traceback" not in err, err
     before = contents(tmp_path / "ray")
     assert start(tmp_path, "out=ray").wait(600) == 0
     after = contents(tmp_path / "ray")
@@ -131,5 +131,6 @@ def test_a_corrupt_frame_and_a_missing_cluster_are_one_line(tmp_path):
         done = subprocess.run(
             command, check=False, cwd=tmp_path, env=quiet_environment(), capture_output=True, text=True
         )
-        assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+        lines = [line for line in done.stderr.strip().splitlines() if "depth unit assumed" not in line]
+        assert done.returncode == 2 and len(lines) == 1, done.stderr
         assert all(word in done.stderr for word in words), done.stderr

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from dhtorch.metrics import calibration, control, errors, monotone, reliability
+from dhtorch.metrics.calibration import fitting
 
 
 def scene_of(n, seed=0, spread=1.0, boast=1.0, floor=0.0):
@@ -24,7 +25,7 @@ def scene_of(n, seed=0, spread=1.0, boast=1.0, floor=0.0):
 
 def fitted(**provenance):
     note = {"method": "test", "scenes": ["a", "b"]} | provenance
-    return calibration.fit_calibration([scene_of(800, s) for s in range(3)], provenance=note)
+    return fitting.fit_calibration([scene_of(800, s) for s in range(3)], provenance=note)
 
 
 def loop_quantile(x, weight, share):
@@ -64,7 +65,7 @@ def test_the_correction_of_sigma_equals_plain_loops(spread, floor, gross):
     scenes[0].sigma[:5], scenes[1].sigma[3] = 0.0, math.inf
     for scene in scenes:
         scene.depth[5 : 5 + gross] *= 3  # gross errors, more than one in ten
-    found = calibration.fit_sigma_model(scenes)
+    found = fitting.fit_sigma_model(scenes)
     scale, floor, wider = loop_sigma(scenes)
     assert (found.scale, found.floor) == pytest.approx((scale, floor), rel=1e-6) and (wider > 1) is (gross > 0)
 
@@ -85,7 +86,7 @@ WIDE = SCENES[2].replace(score=torch.where(SCENES[2].keep, 3 * SCENES[2].score -
     ],
 )
 def test_a_calibration_is_made_of_its_parts(scenes, options, share, ends, targets):
-    found = calibration.fit_calibration(scenes, provenance={"method": "x"}, **options)
+    found = fitting.fit_calibration(scenes, provenance={"method": "x"}, **options)
     score, good, weight = reliability.pool_answers(scenes)
     loss = torch.cat([s.answered().error.clamp(max=1) for s in scenes])
     steps = {"min_share": share, "ends": ends}
@@ -95,7 +96,7 @@ def test_a_calibration_is_made_of_its_parts(scenes, options, share, ends, target
     ):
         assert torch.equal(table.x, expected.x) and torch.equal(table.y, expected.y)
     assert torch.equal(found.sigmoid.slope, monotone.fit_platt(score, good, weight).slope)
-    assert found.sigma == calibration.fit_sigma_model(scenes)
+    assert found.sigma == fitting.fit_sigma_model(scenes)
     assert found.thresholds == {k: control.plug_in_threshold(scenes, k / 100).threshold for k in targets}
     n_scenes = sum(bool(s.keep.any()) for s in scenes)
     assert found.provenance == {"method": "x", "n_scenes": n_scenes, "n_answers": score.numel()}
@@ -119,7 +120,7 @@ def test_a_calibration_is_applied_to_score_and_sigma():
 
 
 def test_an_overconfident_score_becomes_calibrated_in_scenes_that_were_not_fitted():
-    learnt = calibration.fit_calibration([scene_of(4000, seed, boast=0.3) for seed in range(6)])
+    learnt = fitting.fit_calibration([scene_of(4000, seed, boast=0.3) for seed in range(6)])
     fresh = [scene_of(4000, seed, boast=0.3) for seed in range(10, 16)]
     before, after = (reliability.measure_reliability(s)["ece"] for s in (fresh, [learnt.apply(s) for s in fresh]))
     assert before > 0.1 and after < 0.02
@@ -191,8 +192,8 @@ def test_a_damaged_calibration_is_refused_by_file_and_field(path, value, message
 @pytest.mark.parametrize(
     ("error", "message", "call"),
     [
-        (ValueError, "fit_calibration: found no answer", lambda: calibration.fit_calibration([])),
-        (ValueError, "fit_calibration: found no answer", lambda: calibration.fit_calibration([SILENT])),
+        (ValueError, "fit_calibration: found no answer", lambda: fitting.fit_calibration([])),
+        (ValueError, "fit_calibration: found no answer", lambda: fitting.fit_calibration([SILENT])),
         (ValueError, r"provenance\.scenes, expected", lambda: calibration.save_calibration(fitted(scenes=[]), "mine.json")),
         (FileNotFoundError, "nobody: found no calibration, expected .*'map'", lambda: calibration.load_calibration("nobody")),
     ],

@@ -143,7 +143,7 @@ def write_points(root: Path) -> Path:
 
 def write_calibration(root: Path) -> Path:
     """The table of the method ``map``."""
-    return Path(shutil.copy(ROOT / "dhtorch" / "calibration" / "map.json", root / "mine.json"))
+    return Path(shutil.copy(ROOT / "dhtorch" / "metrics" / "calibration" / "map.json", root / "mine.json"))
 
 
 def read_calibration(path: Path) -> None:
@@ -227,7 +227,9 @@ def read_source(path: Path) -> None:
     rows = sum(part.num_rows for part in source.batches(0, tasks))
     assert source.fps > 0 and source.words(0) is not False and source.features
     assert (
-        isinstance(source.stats, dict) and source.splits is not None and all(p.is_file() for p in source.more.values())
+        isinstance(source.meta_file("stats.json"), dict)
+        and source.splits is not None
+        and all(p.is_file() for p in source.more.values())
     )
     source.clips(0, rows)
 
