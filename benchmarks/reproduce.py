@@ -358,7 +358,8 @@ def first_scene(name: str, root: Path, output: Path) -> list[dict[str, Any]] | N
 #: Numbers in groups, curves and points on images, which no page reads.
 _DETAIL = {"overlay", "curves", "gate_share", "hole_share", "ms", "apart", "bias_bins"}
 #: Experiment → those of its scenes that a page or a figure reads.
-_DETAIL_READ = {"method_comparison": {"curves", "ms"}, "hole_census": {"hole_share"}}
+_DETAIL_READ = {"calibration": {"curves"}, "gate_ablation": {"curves"}, "hole_census": {"hole_share"}}
+_DETAIL_READ["method_comparison"] = {"curves", "gate_share", "ms"}
 #: Experiment → numbers of its single pairs that a page reads; of the others the scenes alone are committed.
 _PAIRS_READ = {"validate_study": {"named_kind", "planted_kind", "baseline"}}
 _PAIRS_READ["validate_study"] |= {f"quick_far.{fault}" for fault in ("none", "10_long", "10_short")}
@@ -372,11 +373,6 @@ def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
     some_pairs = [row for row in result["rows"] if row["pair"] is not None and result["experiment"] in _PAIRS_READ]
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in of_scenes or result["rows"]]
     rows += [{k: v for k, v in row.items() if k in of_pair} for row in some_pairs]
-    for row in rows:
-        if "curves" in row:
-            row["curves"] = {
-                "risk_coverage": {k: row["curves"]["risk_coverage"][k] for k in ("coverage", "risk", "oracle")}
-            }
     summary = {k: v for k, v in result["summary"].items() if not left_out & set(k.split("."))}
     return {**result, "rows": rows, "summary": summary}
 
