@@ -312,20 +312,19 @@ class Failure:
     pytest_collectreport = pytest_runtest_logreport
 
 
-def attempt(fault: Fault | None, tree: Path, tests: Sequence[str]) -> str:
+def attempt(fault: Fault, tree: Path, tests: Sequence[str]) -> str:
     """The test that catches a fault in a copy of the tree, "" where none does, by a fork of this process."""
-    file = tree / (fault.file if fault else "README.md")
+    file = tree / fault.file
     source = file.read_text()
     lines = source.splitlines(keepends=True)
-    if fault:
-        lines[fault.line - 1] = fault.new + "\n"
+    lines[fault.line - 1] = fault.new + "\n"
     file.write_text("".join(lines))
     shutil.rmtree(file.parent / "__pycache__", ignore_errors=True)  # two versions may be of one length and second
     failure = tree / "first_failure"
     failure.unlink(missing_ok=True)
     child = os.fork()
     if child == 0:
-        _run_tests(tree, tests, failure, is_cpp=bool(fault and not fault.file.endswith(".py")))
+        _run_tests(tree, tests, failure, is_cpp=not fault.file.endswith(".py"))
     try:
         end = time.monotonic() + 60 + 6 * BUDGET_S
         while not (status := os.waitpid(child, os.WNOHANG))[0]:

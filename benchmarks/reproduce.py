@@ -17,6 +17,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -201,7 +202,7 @@ NEEDS = {name: need or "a quiet machine" for name, need in NEEDS.items()}
 
 #: The tables of README, on fewer scenes, pairs or seeds -> further options: twenty minutes on two cores together.
 QUICK = {
-    "method_comparison": "experiment.seeds=1 pairs.max_pairs=2",
+    "method_comparison": "experiment.seeds=1 pairs.stride=20",
     "dense": "experiment.reference_views=1",
     "align_study": "experiment.reference_views=1",
 }
@@ -256,10 +257,16 @@ def reachable(name: str, root: Path = HERE.parent) -> dict[str, Path]:
     """Name -> file of all code that the command of a result reaches by imports in a checkout."""
     if name in EXPERIMENTS:
         return code.find_reachable_modules([*code.iter_targets(settings(name)), "dhtorch.cli.job"], root / "dhtorch")
-    script = root / "benchmarks" / f"{NAMED.get(name, name)}.py"
-    local = [script, *(root / "benchmarks" / f"{word}.py" for word in ("harness", "cells"))]
-    imports = [each for path in local for each in code.iter_imports(path.read_text())]
-    return {**{path.name: path for path in local}, **code.find_reachable_modules(imports, root / "dhtorch")}
+    scripts = [root / "benchmarks" / f"{NAMED.get(name, name)}.py"]
+    for script in scripts:  # grows by the modules of this folder that it imports
+        words = re.findall(r"^\s*(?:import|from) (\w+)", script.read_text(), re.M)
+        beside = (folder / f"{word}.py" for word in words for folder in (script.parent, root / "benchmarks"))
+        scripts += [path for path in dict.fromkeys(beside) if path.is_file() and path not in scripts]
+    texts = [path.read_text() for path in scripts]
+    imports = [each for text in texts for each in code.iter_imports(text)]
+    imports += ["dhtorch.cli.run"] if any('"dhtorch"' in text for text in texts) else []  # as a process
+    local = {path.relative_to(root).as_posix(): path for path in scripts}
+    return {**local, **code.find_reachable_modules(imports, root / "dhtorch")}
 
 
 def check(name: str) -> str:
@@ -311,7 +318,7 @@ def renew(name: str) -> bool:
     made = provenance().get(name)
     if not check(name):
         return True
-    if made is None or other_settings(name) or not made["commit"]:
+    if made is None or other_settings(name) or not made["commit"] or made["commit"].endswith("-dirty"):
         print(f"{name}: not renewed: {check(name)}")
         return False
     with tempfile.TemporaryDirectory() as folder:

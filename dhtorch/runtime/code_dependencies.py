@@ -11,6 +11,7 @@ import hashlib
 import importlib.util
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,13 @@ def compute_code_digest(files: Mapping[str, Path]) -> str:
 
 def digest_source(path: Path) -> str:
     """SHA-256 of the syntax tree of a Python file without docstrings; of the bytes of any other file."""
-    if path.suffix != ".py":
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    tree = ast.parse(path.read_bytes())
+    content = path.read_bytes()
+    return _digest_syntax(content) if path.suffix == ".py" else hashlib.sha256(content).hexdigest()
+
+
+@lru_cache(maxsize=1024)  # the jobs of a sweep reach the same modules
+def _digest_syntax(source: bytes) -> str:
+    tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
             del node.body[0]
