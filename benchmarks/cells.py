@@ -31,6 +31,7 @@ COLLECTIONS = {
     ),
     "programs": ("clients", "lerobot_train", "lerobot_plugin", "readers_3d", "tiny_field"),
     "recorded": ("captures", "phone", "validate_real", "gravity", "given_poses", "rigs"),
+    "faults": ("fuzz", "kills", "front_door", "capture_faults", "mutants"),
     "trained": ("self_calibration", "far_labels", "learned_confidence", "closed_loop"),
 }
 

@@ -67,7 +67,7 @@ _COARSE_FACTORS: Final = (
 #: Stated poses contradict the depth if their disagreement is at least this multiple of that of the best reading, and
 #: larger by this difference; either pair of limits suffices.
 #: Source: chosen on the sound captures of the shared data (largest: ratio 2.7 at a difference of 0.8 %) and on the
-#: planted conventions, units and lags of benchmarks/results/capture_faults.json.
+#: planted conventions, units and lags of benchmarks/results/faults.json.
 _CONTRADICTION_LIMITS: Final = ((2.0, 0.01), (3.0, 0.003))
 
 #: Disagreement from which on poses contradict the depth although no reading is better; no reading explains more.
