@@ -24,9 +24,10 @@ AppendFrame = Callable[[np.ndarray, float], None]
 LOSSLESS_CODEC, LOSSLESS_PIXELS = "h264", "gbrp"
 
 #: Encoders of previews, the first that PyAV's FFmpeg has, and options of the first: constant quality
-#: (0 lossless … 51) and a fast preset. Source: chosen on holo_a, where colour maps stay free of visible blocks.
+#: (0 lossless … 51) and a fast preset. Source: chosen on holo_a, where colour maps stay free of visible blocks. Without
+#: mbtree, whose look at coming frames reads beside images of a width that 16 does not divide: other bytes in every run.
 _PREVIEW_ENCODERS: Final = ("libx264", "mpeg4")
-_PREVIEW_OPTIONS: Final = {"crf": "20", "preset": "veryfast"}
+_PREVIEW_OPTIONS: Final = {"crf": "20", "preset": "veryfast", "x264-params": "mbtree=0"}
 
 
 @contextmanager
