@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
 from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
-from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.decode import FormatError, refuse_if
 from dhtorch.data.readers import (
     apc,
     arkitscenes,
@@ -278,13 +278,11 @@ def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, An
             :func:`open_capture`.
     """
     root = scenes_root(root)
-    if not scenes:
-        raise FormatError(root, "scenes", "none", "a list of scenes, each with a path")
+    refuse_if(not scenes, root, "scenes", "none", "a list of scenes, each with a path")
     opened: list[Scene] = []
     for scene in scenes:
         options = dict(scene) if isinstance(scene, Mapping) else {}
-        if "path" not in options:
-            raise FormatError(root, "scenes", scene, "entries with a path, as {path:holo_a,near:2.5}")
+        refuse_if("path" not in options, root, "scenes", scene, "entries with a path, as {path:holo_a,near:2.5}")
         opened += open_capture(root / str(options.pop("path")), **options)
     return opened
 
@@ -298,6 +296,11 @@ def scenes_root(root: str | Path | None) -> Path:
     root = root if root is not None else os.environ.get(_SCENES_ROOT_VARIABLE)
     if not root:
         raise FormatError(_SCENES_ROOT_VARIABLE, "environment variable", "nothing", "the folder that holds the scenes")
-    if not Path(root).is_dir():
-        raise FormatError(root, "path", "no such folder", f"the folder that holds the scenes ({_SCENES_ROOT_VARIABLE})")
+    refuse_if(
+        not Path(root).is_dir(),
+        root,
+        "path",
+        "no such folder",
+        f"the folder that holds the scenes ({_SCENES_ROOT_VARIABLE})",
+    )
     return Path(root)

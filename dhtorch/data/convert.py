@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.data.io.decode import FormatError, to_array
+from dhtorch.data.io.decode import FormatError, refuse_if, to_array
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import round_half_up
@@ -48,17 +48,33 @@ def to_camera(
     """
     matrix = to_array(K, (3, 3), file, field)
     f, c, wh = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2], np.array([hw[1], hw[0]])
-    if not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * abs(f[0]):
-        raise FormatError(file, field, matrix.tolist(), "fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
-    if not ((f >= 1 / _MAX_FOCAL_PX) & (f <= _MAX_FOCAL_PX)).all():
-        raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
-    if not ((c > -wh) & (c < 2 * wh)).all():
-        raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
+    refuse_if(
+        not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * abs(f[0]),
+        file,
+        field,
+        matrix.tolist(),
+        "fx 0 cx, 0 fy cy, 0 0 1 (no skew)",
+    )
+    refuse_if(
+        not ((f >= 1 / _MAX_FOCAL_PX) & (f <= _MAX_FOCAL_PX)).all(),
+        file,
+        f"{field} focal length",
+        f.tolist(),
+        "two positive numbers of pixels",
+    )
+    refuse_if(
+        not ((c > -wh) & (c < 2 * wh)).all(),
+        file,
+        f"{field} principal point",
+        c.tolist(),
+        f"a place near the {hw[1]}x{hw[0]} image",
+    )
     lens = None
     if distortion is not None:
         count = len(distortion) if isinstance(distortion, (Sequence, np.ndarray)) else -1
-        if count not in (4, 5, 8):
-            raise FormatError(file, "distortion", distortion, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
+        refuse_if(
+            count not in (4, 5, 8), file, "distortion", distortion, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]"
+        )
         coefficients = to_array(distortion, (count,), file, "distortion")
         if np.abs(coefficients).max() > _MAX_DISTORTION_COEFFICIENT:
             expected = f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}"
@@ -79,8 +95,7 @@ def to_cameras(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, 
         FormatError: another number of columns, or as :func:`to_camera`.
     """
     flat = values.reshape(len(values), -1).astype(np.float64)
-    if flat.shape[1] not in (4, 9):
-        raise FormatError(file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
+    refuse_if(flat.shape[1] not in (4, 9), file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
     if (flat == flat[:1]).all():
         flat = flat[:1]
     cameras_of_rows = [to_camera(make_K(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
@@ -101,8 +116,7 @@ def parse_poses(values: np.ndarray, file: Path, field: str) -> Pose:
     flat = values.reshape(len(values), -1).astype(np.float64)
     if flat.shape[1] == 7:
         return to_poses(to_c2w(flat[:, 3:], flat[:, :3], file, field), file, field)
-    if flat.shape[1] != 16:
-        raise FormatError(file, field, f"{flat.shape[1]} numbers", "16 (4x4 by rows) or 7 (x y z qx qy qz qw)")
+    refuse_if(flat.shape[1] != 16, file, field, f"{flat.shape[1]} numbers", "16 (4x4 by rows) or 7 (x y z qx qy qz qw)")
     return to_poses(flat.reshape(-1, 4, 4), file, field)
 
 

@@ -145,8 +145,7 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
         ValueError: an unknown unit.
     """
     root = Path(folder).expanduser()
-    if not root.is_dir():
-        raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
+    files.refuse_if(not root.is_dir(), root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
     bounds = None if recording.root is not None and recording.bounds is None else root
     with restrict_links(bounds):
         return replace(_open_folder(root, recording, unit), bounds=bounds)
@@ -271,8 +270,9 @@ def _read_npz_depth(file: Path) -> np.ndarray:
 def _read_map(file: Path) -> np.ndarray:
     """NPY or NPZ file → one map (h, w)."""
     array = _ARRAY_READERS[file.suffix.lower()](file).squeeze()
-    if array.ndim != 2 or not 0 < array.size <= MAX_PIXELS:
-        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width)")
+    files.refuse_if(
+        array.ndim != 2 or not 0 < array.size <= MAX_PIXELS, file, "depth", f"shape {array.shape}", "(height, width)"
+    )
     return array
 
 
@@ -287,8 +287,7 @@ def _read_clip(file: Path, _version: tuple[int, ...]) -> np.ndarray:
     for axis in (-1, 1):
         if array.ndim == 4 and array.shape[axis] == 1:
             array = array.squeeze(axis)
-    if array.size == 0:
-        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width) or (maps, height, width)")
+    files.refuse_if(array.size == 0, file, "depth", f"shape {array.shape}", "(height, width) or (maps, height, width)")
     is_one = array.ndim != 3 or 1 in (array.shape[0], array.shape[-1])
     return array[None] if is_one else array
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.io.decode import FormatError, to_array
+from dhtorch.data.io.decode import FormatError, refuse_if, to_array
 
 #: Options of every reader whose captures may lack a K; unset (None), they are ignored by all other readers.
 INTRINSICS_OPTIONS = ("intrinsics", "K", "fov")
@@ -65,8 +65,7 @@ def parse_intrinsics(
     }
     if not stated:
         return ParsedIntrinsics()
-    if len(stated) > 1:
-        raise FormatError(root, "options", " and ".join(f"data.{name}" for name in stated), "one of them")
+    refuse_if(len(stated) > 1, root, "options", " and ".join(f"data.{name}" for name in stated), "one of them")
     ((name, value),) = stated.items()
     if isinstance(value, str):
         return ParsedIntrinsics(feature=value)

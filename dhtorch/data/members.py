@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dhtorch.data.codecs.zips import check_zip_directory
-from dhtorch.data.io.decode import FormatError, read_bytes
+from dhtorch.data.io.decode import FormatError, read_bytes, refuse_if
 from dhtorch.runtime.safe_open import MAX_FILE_BYTES, open_regular
 
 _MAX_MEMBERS = 2_000_000
@@ -58,10 +58,20 @@ class ZipMember(Member):
 
     def read(self) -> bytes:
         """As :meth:`Member.read`; decompression stops at the size in the archive's directory."""
-        if not 0 < self.size <= MAX_FILE_BYTES or self.packed > MAX_FILE_BYTES:
-            raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_FILE_BYTES} bytes")
-        if self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise FormatError(self.path, "compression", "encryption or a rare method", "none or deflate")
+        refuse_if(
+            not 0 < self.size <= MAX_FILE_BYTES or self.packed > MAX_FILE_BYTES,
+            self.path,
+            "file size",
+            f"{self.size} bytes",
+            f"1 to {MAX_FILE_BYTES} bytes",
+        )
+        refuse_if(
+            self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED),
+            self.path,
+            "compression",
+            "encryption or a rare method",
+            "none or deflate",
+        )
         (data,) = self._stored((0, self.packed))
         if self.method == zipfile.ZIP_DEFLATED:
             try:
@@ -128,8 +138,7 @@ def list_zip_members(archive: Path) -> dict[str, Member]:
         raise
     except (zipfile.BadZipFile, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(archive, "archive", error, "a whole zip archive") from None
-    if len(entries) > _MAX_MEMBERS:
-        raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {_MAX_MEMBERS}")
+    refuse_if(len(entries) > _MAX_MEMBERS, archive, "archive", f"{len(entries)} entries", f"at most {_MAX_MEMBERS}")
     members: dict[str, Member] = {}
     for entry in (each for each in entries if not each.is_dir()):
         method = -1 if entry.flag_bits & 0x1 else entry.compress_type  # bit 0: encrypted

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import open_all
-from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.decode import FormatError, refuse_if
 from dhtorch.data.recording import Recording, Recordings, TruthRecording
 from dhtorch.data.scene import Scene, Scenes
 from dhtorch.records import Frame, Pose
@@ -70,8 +70,13 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
     """
     where = recordings[0].root or Path(recordings[0].name) if recordings else Path("rig")
     names = [r.name.rpartition("/")[2] for r in recordings]
-    if len(recordings) < 2 or len(set(names)) < len(names):
-        raise FormatError(where, "cameras", ", ".join(names) or "none", "two or more cameras of different names")
+    refuse_if(
+        len(recordings) < 2 or len(set(names)) < len(names),
+        where,
+        "cameras",
+        ", ".join(names) or "none",
+        "two or more cameras of different names",
+    )
     places = _common_instants(recordings, tolerance)
     if not len(places):
         problem = "no instant common to all cameras"

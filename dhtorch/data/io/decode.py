@@ -69,6 +69,12 @@ def import_optional(*libraries: str, extra: str | None = None) -> ModuleType:
     raise ImportError(f"this format needs {names}, which is not installed: pip install {wanted}")
 
 
+def refuse_if(condition: object, file: str | Path, field: str, value: object, expected: object) -> None:
+    """Raise :class:`FormatError` with the other arguments where ``condition`` is true."""
+    if condition:
+        raise FormatError(file, field, value, expected)
+
+
 def set_opencv_threads(threads: int) -> None:
     """Set OpenCV's number of threads in this process; torch has its own; data-loader workers use one of each."""
     cv2.setNumThreads(threads)

@@ -224,8 +224,13 @@ def _read_pincam(file: Path) -> tuple[tuple[int, int], Camera]:
     """(h, w) of the images that the intrinsics refer to, and the camera."""
     rows = files.read_table(file, 6)
     w, h, fx, fy, cx, cy = files.to_array(rows[0] if len(rows) == 1 else None, (6,), file, "intrinsics").tolist()
-    if min(w, h) < 1 or w * h > files.MAX_PIXELS or w % 1 or h % 1:
-        raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of an image")
+    files.refuse_if(
+        min(w, h) < 1 or w * h > files.MAX_PIXELS or w % 1 or h % 1,
+        file,
+        "width and height",
+        f"{w:g} {h:g}",
+        "the size of an image",
+    )
     hw = (int(h), int(w))
     return hw, convert.to_camera(convert.make_K(fx, fy, cx, cy), hw, file, "intrinsics")
 
@@ -279,8 +284,9 @@ def _list_asset_files(places: Sequence[Path], names: Sequence[str], suffix: str)
 
 
 def _choose_pictures(root: Path, places: Sequence[Path], image: str | None) -> tuple[str, _AssetFiles]:
-    if image not in (None, *_COLOUR_ASSETS):
-        raise FormatError(root, "option image", image, f"one of {', '.join(_COLOUR_ASSETS)}")
+    files.refuse_if(
+        image not in (None, *_COLOUR_ASSETS), root, "option image", image, f"one of {', '.join(_COLOUR_ASSETS)}"
+    )
     for name in (image,) if image else _COLOUR_ASSETS:
         if (pictures := _list_asset_files(places, _COLOUR_ASSETS[name], "png")) is not None:
             return name, pictures
@@ -339,8 +345,9 @@ def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: 
         if (lost := int((keep & ~mask).sum())) > 0:
             report.append(f"{format_count(lost, 'image')} without {what}: left out")
         keep &= mask
-    if not keep.any():
-        raise FormatError(root, f"frames of {name}", "; ".join(report), "images with depth, intrinsics and pose")
+    files.refuse_if(
+        not keep.any(), root, f"frames of {name}", "; ".join(report), "images with depth, intrinsics and pose"
+    )
     return np.flatnonzero(keep)
 
 
@@ -362,8 +369,7 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
     rows = files.read_table(file, 7)
     rows = rows[np.isfinite(rows).all(-1)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
-    if len(rows) == 0:
-        raise FormatError(file, "poses", "no usable row", "rows of stamp, rotation vector and translation")
+    files.refuse_if(len(rows) == 0, file, "poses", "no usable row", "rows of stamp, rotation vector and translation")
     q = convert.to_quaternions(rows[:, 1:4])
     R = convert.to_c2w(q, rows[:, 4:], file, "rotation")[:, :3, :3]  # world to camera
     centre = -np.einsum("nji,nj->ni", R, rows[:, 4:])

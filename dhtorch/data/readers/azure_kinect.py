@@ -92,8 +92,9 @@ def read(
     headers = [video.read_video_header(root, track=track) for track in tracks]
     hw, depth_hw = (header.hw for header in headers)
     option = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    if option.feature is not None:
-        raise FormatError(root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
+    files.refuse_if(
+        option.feature is not None, root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
+    )
     calibration = _read_calibration(root, hw, depth_hw)
     if option.K is not None:
         camera = convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
@@ -223,10 +224,20 @@ def _colour_grid(entry: dict[str, Any], hw: tuple[int, int], file: Path) -> tupl
     h, w = hw
     sensor_h, sensor_w = (files.to_positive(entry.get(f"Sensor{side}"), file, side) for side in ("Height", "Width"))
     aspect = sensor_h / sensor_w
-    if not any(abs(aspect - known) < 1e-3 for known in (_SENSOR_ASPECT, _LEGACY_ASPECT)):
-        raise FormatError(file, "SensorWidth, SensorHeight", f"{sensor_w:g}x{sensor_h:g}", "4:3 or 16:9")
-    if not any(abs(h / w - known) < 1e-3 for known in (_SENSOR_ASPECT, _LEGACY_ASPECT)):
-        raise FormatError(file, "colour size", f"{w}x{h}", "4:3 or 16:9, a mode of the camera")
+    files.refuse_if(
+        not any(abs(aspect - known) < 1e-3 for known in (_SENSOR_ASPECT, _LEGACY_ASPECT)),
+        file,
+        "SensorWidth, SensorHeight",
+        f"{sensor_w:g}x{sensor_h:g}",
+        "4:3 or 16:9",
+    )
+    files.refuse_if(
+        not any(abs(h / w - known) < 1e-3 for known in (_SENSOR_ASPECT, _LEGACY_ASPECT)),
+        file,
+        "colour size",
+        f"{w}x{h}",
+        "4:3 or 16:9, a mode of the camera",
+    )
     return w, w * aspect, 0.0, (w * aspect - h) / 2
 
 
@@ -234,14 +245,16 @@ def _parse_lens(
     entry: dict[str, Any], grid: tuple[float, float, float, float], hw: tuple[int, int], file: Path
 ) -> _Lens:
     kind = files.get_entry(entry, "Intrinsics.ModelType", str, file)
-    if not kind.endswith("BrownConrady"):
-        raise FormatError(file, "ModelType", kind, "CALIBRATION_LensDistortionModelBrownConrady")
+    files.refuse_if(
+        not kind.endswith("BrownConrady"), file, "ModelType", kind, "CALIBRATION_LensDistortionModelBrownConrady"
+    )
     values = files.get_entry(entry, "Intrinsics.ModelParameters", list, file)
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = files.to_array(
         values, (_N_PARAMETERS,), file, "ModelParameters"
     ).tolist()
-    if codx or cody:
-        raise FormatError(file, "ModelParameters codx, cody", f"{codx:g}, {cody:g}", "0, a distortion about the axis")
+    files.refuse_if(
+        codx or cody, file, "ModelParameters codx, cody", f"{codx:g}, {cody:g}", "0, a distortion about the axis"
+    )
     w, h, left, top = grid
     # Normalised values count from the corner of the first pixel, ours from its centre.
     K = convert.make_K(fx * w, fy * h, cx * w - left - 0.5, cy * h - top - 0.5)

@@ -84,11 +84,11 @@ def read(
     """
     root = Path(root)
     files.to_positive(max_disagreement, root, "option max_disagreement")
-    if confidence not in ("unit", "level", None):
-        raise FormatError(root, "option confidence", confidence, "unit, level or None")
+    files.refuse_if(
+        confidence not in ("unit", "level", None), root, "option confidence", confidence, "unit, level or None"
+    )
     archives = sorted(root.glob("ca1m-*.tar")) if root.is_dir() else [root]
-    if not archives:
-        raise FormatError(root, "archives", "none", "ca1m-<split>-<video id>.tar")
+    files.refuse_if(not archives, root, "archives", "none", "ca1m-<split>-<video id>.tar")
     skip = {"wide/depth/confidence"} if confidence is None else set()
     skip |= set() if truth else {"gt/depth"}
     open_archive = partial(
@@ -197,8 +197,7 @@ def _make_recording(
         if len(kept) < len(keys):
             report.append(f"{format_count(len(keys) - len(kept), 'frame')} without {what}: left out")
         keys = kept
-    if not keys:
-        raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(required)}")
+    files.refuse_if(not keys, archive, "frames", "; ".join(report) or "none", f"members {', '.join(required)}")
     if confidence and "wide/depth/confidence" not in available:
         report.append("no confidence: all returns are weighted equally")
     spans = {

@@ -62,16 +62,17 @@ def read(
         FormatError: a missing or damaged file, no image, an unknown camera, or values that are no camera or pose.
     """
     root = Path(root)
-    if not 0 <= crop_bottom < 1:
-        raise FormatError(root, "option crop_bottom", crop_bottom, "a fraction of the height, 0 to less than 1")
+    files.refuse_if(
+        not 0 <= crop_bottom < 1, root, "option crop_bottom", crop_bottom, "a fraction of the height, 0 to less than 1"
+    )
     scenes = sorted(root.glob("scene_*.json")) if root.is_dir() else []
-    if len(scenes) != 1:
-        raise FormatError(root, "scene_*.json", f"{len(scenes)} such files", "exactly one")
+    files.refuse_if(len(scenes) != 1, root, "scene_*.json", f"{len(scenes)} such files", "exactly one")
     shots = _read_shots(scenes[0])
     present = sorted({name for name, list_ in shots.items() if any((root / s.image).is_file() for s in list_)})
     unknown = sorted(set(cameras or ()) - set(present))
-    if unknown or not present:
-        raise FormatError(root, "cameras", ", ".join(unknown or ["no image"]), f"images of {', '.join(shots)}")
+    files.refuse_if(
+        unknown or not present, root, "cameras", ", ".join(unknown or ["no image"]), f"images of {', '.join(shots)}"
+    )
     report = [f"{name}: no image on disk: left out" for name in shots if name not in present]
     options = {"crop_bottom": crop_bottom, "hide_px": hide_px}
     return [_make_recording(scenes[0], name, shots[name], report, **options) for name in cameras or present]
@@ -109,8 +110,13 @@ def _load_frame(
     T = se3.relative(T_world_from_lidar[i : i + 1], T_world_from_cam[i : i + 1])
     file, fields = root / shot.sweep, shot.fields
     data = npy.read_npz(file, "data")
-    if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
-        raise FormatError(file, "data", f"shape {data.shape}", f"points with columns {', '.join(fields)}")
+    files.refuse_if(
+        not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields),
+        file,
+        "data",
+        f"shape {data.shape}",
+        f"points with columns {', '.join(fields)}",
+    )
     points = np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)
     xyz = se3.apply(T, torch.from_numpy(points)[None])
     depth = convert.splat_depth(xyz[0], camera, shot.hw, hide_px)
@@ -121,8 +127,7 @@ def _load_frame(
 def _make_recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
     root = scene.parent
     complete = [s for s in shots if (root / s.image).is_file() and (root / s.sweep).is_file()]
-    if not complete:
-        raise FormatError(root, name, "no instant with image and sweep on disk", "at least one")
+    files.refuse_if(not complete, root, name, "no instant with image and sweep on disk", "at least one")
     report = report + [
         f"{name}: instant {s.number} lacks its image or its sweep: left out" for s in shots if s not in complete
     ]
@@ -166,8 +171,7 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
         members = [data[key] for key in keys if key in data]
         kinds = [files.get_entry(d, "datum", dict, scene) for d in members]
         sweeps = [k["point_cloud"] for k in kinds if "point_cloud" in k]
-        if len(sweeps) != 1:
-            raise FormatError(scene, f"samples.{number}", f"{len(sweeps)} LiDAR sweeps", "one")
+        files.refuse_if(len(sweeps) != 1, scene, f"samples.{number}", f"{len(sweeps)} LiDAR sweeps", "one")
         for member, kind in zip(members, kinds, strict=True):
             if "image" in kind:
                 name = files.get_entry(member, "id.name", str, scene)
@@ -190,11 +194,15 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
                     hw=(files.get_entry(image, "height", int, scene), files.get_entry(image, "width", int, scene)),
                 )
                 of_camera = shots.setdefault(name, [])
-                if of_camera and of_camera[-1].number == number:
-                    raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
+                files.refuse_if(
+                    of_camera and of_camera[-1].number == number,
+                    scene,
+                    f"samples.{number}",
+                    f"two images of {name}",
+                    "one of each camera",
+                )
                 of_camera.append(shot)
-    if not shots:
-        raise FormatError(scene, "samples", "no image", "instants with camera images")
+    files.refuse_if(not shots, scene, "samples", "no image", "instants with camera images")
     return shots
 
 
@@ -210,8 +218,13 @@ def _parse_pose(datum: dict[str, Any], scene: Path) -> np.ndarray:
 def _read_camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
     calibration = files.read_json(file)
     names, intrinsics = (files.get_entry(calibration, key, list, file) for key in ("names", "intrinsics"))
-    if name not in names or len(names) != len(intrinsics):
-        raise FormatError(file, "names", ", ".join(map(str, names)), f"{name} among as many names as intrinsics")
+    files.refuse_if(
+        name not in names or len(names) != len(intrinsics),
+        file,
+        "names",
+        ", ".join(map(str, names)),
+        f"{name} among as many names as intrinsics",
+    )
     entry = intrinsics[names.index(name)]
     fx, fy, cx, cy, skew = (files.get_entry(entry, key, (int, float), file) for key in ("fx", "fy", "cx", "cy", "skew"))
     return convert.to_camera([[fx, skew, cx], [0, fy, cy], [0, 0, 1]], hw, file, f"{name} intrinsics")
@@ -219,6 +232,11 @@ def _read_camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
 
 def _check_relative_path(name: str, scene: Path) -> str:
     """``name``, checked to be a relative path inside the scene's folder."""
-    if not name or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise FormatError(scene, "filename", name, "a file inside the scene's folder")
+    files.refuse_if(
+        not name or Path(name).is_absolute() or ".." in Path(name).parts,
+        scene,
+        "filename",
+        name,
+        "a file inside the scene's folder",
+    )
     return name

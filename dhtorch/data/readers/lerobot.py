@@ -166,8 +166,9 @@ def _name(meta: LeRobotMeta, key: str, episode: int) -> str:
 def _find_column(meta: LeRobotMeta, key: str, option: str | None, what: str) -> str | None:
     """The feature of the option, else the one named for ``what`` of the camera; None where there is none."""
     if option is not None:
-        if option not in meta.features:
-            raise FormatError(meta.root, f"option {what}", option, f"one of {', '.join(meta.features)}")
+        files.refuse_if(
+            option not in meta.features, meta.root, f"option {what}", option, f"one of {', '.join(meta.features)}"
+        )
         return option
     camera = key.rsplit(".", maxsplit=1)[-1]
     above = f"observation.camera.{camera}", f"observation.{camera}"
@@ -242,8 +243,13 @@ class _Load:
     def _numbers(self, i: int, feature: LeRobotFeature) -> np.ndarray:
         """Numbers (h, w) of a row, stored as an array."""
         values = np.asarray(read_cell(self.data, feature.key, int(self.rows[i])))
-        if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
-            raise FormatError(self.data, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
+        files.refuse_if(
+            values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu",
+            self.data,
+            feature.key,
+            f"shape {values.shape}",
+            f"{feature.hw} numbers",
+        )
         return values.reshape(feature.hw)
 
     def _within(self, depth: np.ndarray) -> Tensor:

@@ -113,8 +113,13 @@ def find_depth_feature(meta: LeRobotMeta, camera: str, requested: str | None) ->
     """The depth feature of a camera: as ``requested``, named like the camera, enriched, or the only one; else None."""
     depths = {key: f for key, f in meta.features.items() if f.is_depth and len(f.shape) >= 2}
     if requested is not None:
-        if requested not in meta.features or len(meta.features[requested].shape) < 2:
-            raise FormatError(meta.root, "option depth", requested, f"one of {', '.join(depths) or 'none'}")
+        files.refuse_if(
+            requested not in meta.features or len(meta.features[requested].shape) < 2,
+            meta.root,
+            "option depth",
+            requested,
+            f"one of {', '.join(depths) or 'none'}",
+        )
         return meta.features[requested]
     matching = [f for key, f in depths.items() if _distinctive_words(key) == _distinctive_words(camera)]
     if len(matching) == 1:
@@ -142,8 +147,13 @@ def dequantise_depth(feature: LeRobotFeature, codes: np.ndarray, file: Path) -> 
     Raises:
         FormatError: codes of more bits, or an invalid range in the feature's info.
     """
-    if codes.dtype != np.uint16 or codes.max(initial=0) >= N_CODES:
-        raise FormatError(file, f"{feature.key} pixels", f"{codes.dtype} up to {codes.max(initial=0)}", "12-bit codes")
+    files.refuse_if(
+        codes.dtype != np.uint16 or codes.max(initial=0) >= N_CODES,
+        file,
+        f"{feature.key} pixels",
+        f"{codes.dtype} up to {codes.max(initial=0)}",
+        "12-bit codes",
+    )
     metres = metres_by_code(feature.info, feature.key, file)
     low, high = find_return_range(feature.info, feature.key, file)
     return np.where((metres > low) & (metres <= high), metres, 0.0)[codes]

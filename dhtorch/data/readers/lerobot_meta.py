@@ -128,8 +128,7 @@ def read_lerobot_meta(root: Path) -> LeRobotMeta:
         raise FormatError(file, "codebase_version", text, "v2.x or v3.x")
     number = int(version[1])
     chunks = info.get("chunks_size", 1000)
-    if type(chunks) is not int or not 0 < chunks < 10**9:
-        raise FormatError(file, "chunks_size", chunks, "a positive number")
+    files.refuse_if(type(chunks) is not int or not 0 < chunks < 10**9, file, "chunks_size", chunks, "a positive number")
     templates = {"data_path": (_V2_DATA, _V3_DATA), "video_path": (_V2_VIDEO, _V3_VIDEO)}
     paths = {key: info.get(key) or defaults[number - 2] for key, defaults in templates.items()}
     for key, value in paths.items():
@@ -170,8 +169,7 @@ def read_lerobot_episodes(meta: LeRobotMeta, wanted: Sequence[int] | None) -> Le
 
 def _read_columns_v3(meta: LeRobotMeta) -> dict[str, np.ndarray]:
     tables = sorted((meta.root / "meta" / "episodes").glob("*/*.parquet"))
-    if not tables:
-        raise FormatError(meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
+    files.refuse_if(not tables, meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
     prefixes = ["data", *(f"videos/{key}" for key in meta.videos)]
     counts = ["episode_index", *(f"{prefix}/{part}" for prefix in prefixes for part in _FILE_INDEX_COLUMNS)]
     starts = [f"videos/{key}/from_timestamp" for key in meta.videos]
@@ -196,8 +194,13 @@ def _read_columns_v2(meta: LeRobotMeta) -> dict[str, np.ndarray]:
         if text.strip():
             row = files.decode_json(text, table)
             rows.append([files.get_entry(row, key, int, table) for key in ("episode_index", "length")])
-            if not all(0 <= value < _MAX_EPISODES for value in rows[-1]):
-                raise FormatError(table, f"line {line}", rows[-1], f"counts below {_MAX_EPISODES}")
+            files.refuse_if(
+                not all(0 <= value < _MAX_EPISODES for value in rows[-1]),
+                table,
+                f"line {line}",
+                rows[-1],
+                f"counts below {_MAX_EPISODES}",
+            )
     numbers = np.array(rows, dtype=np.int64).reshape(-1, 2)
     return {"episode_index": numbers[:, 0], "length": numbers[:, 1]}
 
@@ -213,10 +216,13 @@ def select_colour_keys(meta: LeRobotMeta, requested: str | Sequence[str] | None 
     colour = [key for key in pictures if not ours & meta.features[key].info.keys()]
     keys = colour if requested is None else [requested] if isinstance(requested, str) else list(requested)
     unknown = [key for key in keys if key not in colour]
-    if unknown or not keys:
-        raise FormatError(
-            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"some of {', '.join(colour)}"
-        )
+    files.refuse_if(
+        unknown or not keys,
+        meta.root / "meta" / "info.json",
+        "cameras",
+        ", ".join(unknown) or "none",
+        f"some of {', '.join(colour)}",
+    )
     return keys
 
 
@@ -231,8 +237,7 @@ def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> 
         return str(values[name]).zfill(int(width or 0))
 
     name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
-    if "{" in name or "}" in name:
-        raise FormatError(file, key, template, "a path with fields such as {file_index:03d}")
+    files.refuse_if("{" in name or "}" in name, file, key, template, "a path with fields such as {file_index:03d}")
     return files.resolve_inside(meta.root, name, file, key)
 
 
@@ -245,8 +250,13 @@ def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
         or any(type(n) is not int or not 0 <= n < 2**31 for n in shape)
     ):
         raise FormatError(file, f"features.{key}.shape", shape, "a few counts")
-    if dtype in ("video", "image") and (len(shape) not in (2, 3) or not 0 < math.prod(shape) <= 4 * files.MAX_PIXELS):
-        raise FormatError(file, f"features.{key}.shape", shape, "height, width and channels")
+    files.refuse_if(
+        dtype in ("video", "image") and (len(shape) not in (2, 3) or not 0 < math.prod(shape) <= 4 * files.MAX_PIXELS),
+        file,
+        f"features.{key}.shape",
+        shape,
+        "height, width and channels",
+    )
     info = value.get("info") or value.get("video_info") or {}
     if not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."):
         raise FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")

@@ -42,8 +42,13 @@ def _read_cached_table(file: Path, _version: tuple[int, ...], extra: tuple[str, 
     for name, values in read_columns(file, [index_columns[0], *extra], optional=index_columns[1:]).items():
         if not isinstance(values, np.ndarray):
             raise FormatError(file, name, "no numbers", "numbers")
-        if name in index_columns and values.size != len(values):
-            raise FormatError(file, name, f"shape {values.shape}", "one number per row")
+        files.refuse_if(
+            name in index_columns and values.size != len(values),
+            file,
+            name,
+            f"shape {values.shape}",
+            "one number per row",
+        )
         table[name] = values.reshape(-1) if name in index_columns else values
     return table
 
@@ -77,8 +82,7 @@ def select_episode_rows(
             f"episode {episode.number}: {format_count(len(rows), 'row')}, {episode.length} according to meta/episodes"
         )
     rows, number, stamp = rows[keep], number[keep], stamp[keep]
-    if len(rows) == 0:
-        raise FormatError(episode.data, f"episode {episode.number}", "no usable row", "frames")
+    files.refuse_if(len(rows) == 0, episode.data, f"episode {episode.number}", "no usable row", "frames")
     grid = number / meta.fps
     shift = float(np.median(stamp - grid))
     if abs(shift) > _MAX_GRID_ERROR_S and (np.abs(stamp - grid - shift) < _MAX_GRID_ERROR_S).all():
@@ -151,8 +155,7 @@ def find_row_stamps(file: Path, start: float, times: np.ndarray) -> tuple[np.nda
         FormatError: no video, or one without frames.
     """
     stamps = read_video_times(file)
-    if len(stamps) == 0:
-        raise FormatError(file, "frames", "none", "at least one")
+    files.refuse_if(len(stamps) == 0, file, "frames", "none", "at least one")
     # A video of one episode starts with it, whatever its first time stamp.
     return stamps, times + start + (float(stamps[0]) if start == 0 else 0.0)
 

@@ -117,14 +117,12 @@ def read(
     c2w, unposed, remarks = _select_posed([shot.number for shot in shots], meta, poses)
     posed = [shot for shot in shots if shot.number not in unposed]
     report += uncovered + remarks + files.format_left_out(sorted(unposed), "its pose is not usable (tracking lost)")
-    if not posed:
-        raise FormatError(inner, "frames", "; ".join(report) or "none", _WHOLE_EXPORT)
+    files.refuse_if(not posed, inner, "frames", "; ".join(report) or "none", _WHOLE_EXPORT)
     hw, depth_hw = _find_sizes(posed, meta)
     load = partial(_load_frame, shots=tuple(posed), meta=meta, hw=hw, depth_hw=depth_hw, exr_channel=exr_channel)
     intact = [i for i, shot in enumerate(posed) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
     report += files.format_left_out([shot.number for i, shot in enumerate(posed) if i not in set(intact)], "damaged")
-    if not intact:
-        raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
+    files.refuse_if(not intact, inner, "frames", "; ".join(report), "frames that decode")
     first = posed[intact[0]].image
     exif = files.decode_image_header(first.read(), first.path).orientation
     number = torch.tensor([posed[i].number for i in intact])
@@ -194,8 +192,7 @@ def _load_frame(
     if shot.conf is not None:
         content = lzfse.decompress_lzfse(shot.conf.read(), h * w, shot.conf.path, "confidence")
         levels = np.frombuffer(content, np.uint8)
-        if levels.max() > 2:
-            raise FormatError(shot.conf.path, "confidence", int(levels.max()), "0, 1 or 2")
+        files.refuse_if(levels.max() > 2, shot.conf.path, "confidence", int(levels.max()), "0, 1 or 2")
         conf = torch.from_numpy(levels.reshape(1, h, w).copy())
     return Frame(
         image=torch.from_numpy(image)[None],
@@ -219,8 +216,13 @@ def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
     coefficients = _parse_rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
     if coefficients is None:
         K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # stored by columns
-        if K[2].tolist() != [0, 0, 1] or K[0, 1] != 0 or K[1, 0] != 0:
-            raise FormatError(file, "K", K.T.ravel().tolist(), "fx 0 0 0 fy 0 cx cy 1")
+        files.refuse_if(
+            K[2].tolist() != [0, 0, 1] or K[0, 1] != 0 or K[1, 0] != 0,
+            file,
+            "K",
+            K.T.ravel().tolist(),
+            "fx 0 0 0 fy 0 cx cy 1",
+        )
         coefficients = np.array([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]])
     elif not np.isfinite(coefficients).all():
         raise FormatError(file, "perFrameIntrinsicCoeffs", "a number that is not finite", "fx fy cx cy of each frame")
@@ -242,8 +244,13 @@ def _parse_size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> t
     if value.get(high) is None and value.get(wide) is None:
         return None
     h, w = (files.to_positive(value.get(key), file, key) for key in (high, wide))
-    if h != int(h) or w != int(w) or h * w > files.MAX_PIXELS:
-        raise FormatError(file, f"{wide}, {high}", f"{w:g}x{h:g}", f"whole numbers, 1 to {files.MAX_PIXELS} pixels")
+    files.refuse_if(
+        h != int(h) or w != int(w) or h * w > files.MAX_PIXELS,
+        file,
+        f"{wide}, {high}",
+        f"{w:g}x{h:g}",
+        f"whole numbers, 1 to {files.MAX_PIXELS} pixels",
+    )
     return int(h), int(w)
 
 
@@ -268,8 +275,7 @@ def _list_shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot],
     for name, part in members.items():
         if match := _MEMBER_PATTERN.fullmatch(name):
             parts.setdefault(int(match[1]), {})["depth" if match[2] == "exr" else match[2]] = part
-    if not parts:
-        raise FormatError(root, "frames", "none", _WHOLE_EXPORT)
+    files.refuse_if(not parts, root, "frames", "none", _WHOLE_EXPORT)
     required = ["jpg", "depth"] + (["conf"] if any("conf" in files_of for files_of in parts.values()) else [])
     names = {"jpg": "picture", "depth": "depth", "conf": "confidence"}
     shots, missing = [], dict[str, list[int]]()

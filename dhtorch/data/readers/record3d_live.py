@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert
-from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.data.io.decode import import_optional, refuse_if
 from dhtorch.records import Frame, Pose
 
 _SOURCE = Path("record3d:usb")
@@ -64,13 +64,17 @@ class LiveFrames:
     def __enter__(self) -> Self:
         if self.device is None:
             devices = list(self.stream.get_connected_devices())
-            if not devices:
-                raise FormatError(_SOURCE, "devices", "none", "a phone on the cable with Record3D in USB mode")
+            refuse_if(not devices, _SOURCE, "devices", "none", "a phone on the cable with Record3D in USB mode")
             self.device = devices[0]
         self.stream.on_new_frame = self._on_frame
         self.stream.on_stream_stopped = self._on_stop
-        if self.stream.connect(self.device) is False:
-            raise FormatError(_SOURCE, "connection", "refused", "a phone with Record3D in USB mode")
+        refuse_if(
+            self.stream.connect(self.device) is False,
+            _SOURCE,
+            "connection",
+            "refused",
+            "a phone with Record3D in USB mode",
+        )
         return self
 
     def __exit__(
@@ -82,8 +86,13 @@ class LiveFrames:
     def __iter__(self) -> Iterator[Frame]:
         while True:
             with self._news:
-                if not self._news.wait_for(lambda: self._frames or self._error or self._stopped, self.timeout):
-                    raise FormatError(_SOURCE, "frames", f"none within {self.timeout} s", "a phone that streams")
+                refuse_if(
+                    not self._news.wait_for(lambda: self._frames or self._error or self._stopped, self.timeout),
+                    _SOURCE,
+                    "frames",
+                    f"none within {self.timeout} s",
+                    "a phone that streams",
+                )
                 if self._error:
                     raise self._error
                 if not self._frames:
@@ -116,8 +125,13 @@ class LiveFrames:
         rgb = _copy_buffer(self.stream.get_rgb_frame(), "rgb", np.uint8, 3)
         depth = _copy_buffer(self.stream.get_depth_frame(), "depth", np.float32, 2)
         conf = _copy_buffer(self.stream.get_confidence_frame(), "confidence", np.uint8, 2)
-        if conf.size and (conf.shape != depth.shape or conf.max() > 2):
-            raise FormatError(_SOURCE, "confidence", f"{conf.shape} up to {conf.max()}", f"{depth.shape}, 0, 1 or 2")
+        refuse_if(
+            conf.size and (conf.shape != depth.shape or conf.max() > 2),
+            _SOURCE,
+            "confidence",
+            f"{conf.shape} up to {conf.max(initial=0)}",
+            f"{depth.shape}, 0, 1 or 2",
+        )
         k = self.stream.get_intrinsic_mat()
         hw = (rgb.shape[0], rgb.shape[1])
         camera = convert.to_camera(convert.make_K(k.fx, k.fy, k.tx, k.ty), hw, _SOURCE, "intrinsics")
@@ -143,6 +157,11 @@ def _copy_buffer(buffer: Any, field: str, dtype: type, ndim: int) -> np.ndarray:
     """Checked copy of the library's buffer."""
     array = np.array(buffer, copy=True)
     shape_fits = array.ndim == ndim and (ndim == 2 or array.shape[2] == 3)
-    if array.dtype != dtype or not (shape_fits or (array.size == 0 and field == "confidence")):
-        raise FormatError(_SOURCE, field, f"{array.dtype} of shape {array.shape}", f"{np.dtype(dtype)}, {ndim} axes")
+    refuse_if(
+        array.dtype != dtype or not (shape_fits or (array.size == 0 and field == "confidence")),
+        _SOURCE,
+        field,
+        f"{array.dtype} of shape {array.shape}",
+        f"{np.dtype(dtype)}, {ndim} axes",
+    )
     return array

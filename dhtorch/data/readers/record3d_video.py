@@ -138,8 +138,9 @@ def _read_metadata(file: Path) -> tuple[dict[str, Any], Path]:
     at = tail.rfind(_METADATA_START)
     if at < 0:
         side_car = file.parent / "metadata.json"
-        if not side_car.is_file():
-            raise FormatError(file, "intrinsicMatrix", "neither in the file nor in a metadata.json", "one of them")
+        files.refuse_if(
+            not side_car.is_file(), file, "intrinsicMatrix", "neither in the file nor in a metadata.json", "one of them"
+        )
         return files.read_json(side_car), side_car
     try:  # other bytes follow
         return json.JSONDecoder().raw_decode(tail[at:].decode("utf-8", errors="replace"))[0], file

@@ -75,14 +75,21 @@ def read(root: str | Path) -> list[Recording]:
         (file, pair), report = _read_views_pair(root), (_VIEWS_ASSUMPTION,)
     else:
         file, pair = _read_npz_pair(root)
-    if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
-        raise FormatError(file, "baseline", pair.baseline, "a positive length")
+    files.refuse_if(
+        not 0 < pair.baseline <= convert.MAX_COORDINATE_M, file, "baseline", pair.baseline, "a positive length"
+    )
     left, right = pair.cameras
-    if not torch.equal(left.f, right.f):
-        raise FormatError(file, "focal length", f"{left.f.tolist()} and {right.f.tolist()}", "equal ones")
+    files.refuse_if(
+        not torch.equal(left.f, right.f),
+        file,
+        "focal length",
+        f"{left.f.tolist()} and {right.f.tolist()}",
+        "equal ones",
+    )
     shift = float(right.c[0, 0] - left.c[0, 0])
-    if abs(shift - pair.doffs) > 0.5:
-        raise FormatError(file, "doffs", pair.doffs, f"{shift:g}, the difference of the principal points")
+    files.refuse_if(
+        abs(shift - pair.doffs) > 0.5, file, "doffs", pair.doffs, f"{shift:g}, the difference of the principal points"
+    )
     eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).clone()
     t = torch.tensor([[0.0, 0.0, 0.0], [pair.baseline, 0.0, 0.0]], dtype=torch.float64)
     return [
@@ -133,8 +140,7 @@ def _read_calib_pair(root: Path) -> tuple[Path, _Pair]:
     hw = files.read_image_header(images[0]).hw
     names = ("height", "width", "baseline", "doffs")
     h, w, baseline, doffs = (float(files.to_array(entries.get(name), (), file, name)) for name in names)
-    if (h, w) != hw:
-        raise FormatError(file, "width and height", f"{w:g}x{h:g}", f"{hw[1]}x{hw[0]}, as im0.png")
+    files.refuse_if((h, w) != hw, file, "width and height", f"{w:g}x{h:g}", f"{hw[1]}x{hw[0]}, as im0.png")
     maps = [[root / f"disp{i}.pfm", root / f"disp{i}GT.pfm"] for i in (0, 1)]
     first, second = (next((each for each in named if each.is_file()), None) for named in maps)
     if first is None:
@@ -149,8 +155,7 @@ def _read_npz_pair(root: Path) -> tuple[Path, _Pair]:
     names = {}
     for kind in ("left.png", "right.png", "disp.npz"):
         matching = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
-        if len(matching) != 1:
-            raise FormatError(root, f"*_{kind}", f"{len(matching)} such files", "exactly one")
+        files.refuse_if(len(matching) != 1, root, f"*_{kind}", f"{len(matching)} such files", "exactly one")
         names[kind] = matching[0]
     file = root / "meta.json"
     meta = files.read_json(file)
@@ -181,6 +186,5 @@ def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if file.suffix == ".png":
         return files.read_image(file, hw)[0]
     disparity = npy.read_npz(file, "arr_0")
-    if disparity.shape != hw:
-        raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
+    files.refuse_if(disparity.shape != hw, file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
     return disparity

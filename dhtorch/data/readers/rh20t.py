@@ -120,8 +120,9 @@ def read(
         raise FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
     incomplete = {} if serials else {s: reason for s in present if (reason := rig.lacks(s))}
     opened = [s for s in serials or present if s not in incomplete]
-    if not opened:
-        raise FormatError(root, "cameras", ", ".join(incomplete.values()) or "none", "one with images and calibration")
+    files.refuse_if(
+        not opened, root, "cameras", ", ".join(incomplete.values()) or "none", "one with images and calibration"
+    )
     left_out = tuple(f"camera {s}: {reason}: left out" for s, reason in incomplete.items())
     doubtful = meta.get("bad_calib_view", ())
     doubtful_serials = {str(s) for s in doubtful} if isinstance(doubtful, list) else set()
@@ -188,10 +189,13 @@ class _SceneCameras:
         if depth.is_file():
             high, wide = read_video_header(depth).hw
             depth_size = (high // 2, wide)
-            if high % 2 or depth_size[0] * size[1] != depth_size[1] * size[0]:
-                raise FormatError(
-                    depth, "size", f"{wide}x{high}", f"twice as high as an image like {size[1]}x{size[0]}"
-                )
+            files.refuse_if(
+                high % 2 or depth_size[0] * size[1] != depth_size[1] * size[0],
+                depth,
+                "size",
+                f"{wide}x{high}",
+                f"twice as high as an image like {size[1]}x{size[0]}",
+            )
         else:
             notes.append(f"camera {serial}: no depth.mp4: depth is empty")
         places, times = self._places(home / "timestamps.npy", header.n, depth if depth.is_file() else None, notes)
@@ -227,8 +231,13 @@ class _SceneCameras:
         if K is None or K.shape not in ((3, 3), (3, 4)) or K.dtype.kind not in "fiu" or (K[:, 3:] != 0).any():
             problem = type(value).__name__ if K is None else f"an array of shape {K.shape}"
             raise FormatError(file, serial, problem, "3x3 intrinsics, or 3x4 with a zero column")
-        if hw[0] * self.hw[1] != hw[1] * self.hw[0]:
-            raise FormatError(file, "image size", f"{hw[1]}x{hw[0]}", f"the shape of {self.hw[1]}x{self.hw[0]}")
+        files.refuse_if(
+            hw[0] * self.hw[1] != hw[1] * self.hw[0],
+            file,
+            "image size",
+            f"{hw[1]}x{hw[0]}",
+            f"the shape of {self.hw[1]}x{self.hw[0]}",
+        )
         full = convert.to_camera(K[:, :3].astype(np.float64), self.hw, file, serial)
         return cameras.resize(full.to(torch.float64), self.hw, hw).to(torch.float32)
 
@@ -258,8 +267,9 @@ class _SceneCameras:
         if len(pairs) < len(colour):
             images = format_count(len(colour) - len(pairs), "image")
             notes.append(f"{images} without depth within {self.max_difference} s: left out")
-        if not pairs:
-            raise FormatError(file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs")
+        files.refuse_if(
+            not pairs, file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs"
+        )
         return tuple((k, j) for k, j, _ in pairs), np.array([t for _, _, t in pairs])
 
     def _poses(self, serial: str, times: np.ndarray, notes: list[str]) -> tuple[Pose | None, np.ndarray]:
@@ -279,13 +289,17 @@ class _SceneCameras:
             notes.append(f"camera {serial} is on the hand, without {missing}: no poses")
             return None, all_covered
         stream = read_tcp_in_base(self.root)
-        if not len(stream.times):
-            raise FormatError(self.root / "transformed" / "tcp_base.npy", "entries", "none usable", "poses")
+        files.refuse_if(
+            not len(stream.times), self.root / "transformed" / "tcp_base.npy", "entries", "none usable", "poses"
+        )
         tcp, covered = stream.at(times, self.max_gap)
-        if not covered.any():
-            raise FormatError(
-                self.root / "transformed" / "tcp_base.npy", "time stamps", "none near an image", "overlap"
-            )
+        files.refuse_if(
+            not covered.any(),
+            self.root / "transformed" / "tcp_base.npy",
+            "time stamps",
+            "none near an image",
+            "overlap",
+        )
         if not covered.all():
             notes.append(
                 f"camera {serial}: {format_count(int((~covered).sum()), 'frame')} in a gap of the tcp stream: left out"

@@ -194,8 +194,9 @@ def ms_to_seconds(value: Any, file: Path, field: str) -> float:
 def _make_stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool = False) -> RobotStream:
     """Stream of entries in any order; of several with one stamp the last."""
     merged = dict(entries)
-    if len({len(value) for value in merged.values()}) > 1:
-        raise FormatError(file, "entries", "vectors of several lengths", "one length")
+    files.refuse_if(
+        len({len(value) for value in merged.values()}) > 1, file, "entries", "vectors of several lengths", "one length"
+    )
     times = np.array(sorted(merged), dtype=np.float64)
     return RobotStream(times, np.stack([merged[t] for t in times.tolist()]) if merged else np.zeros((0, 0)), pose)
 

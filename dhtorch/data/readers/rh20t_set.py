@@ -47,8 +47,7 @@ def open_set(
         FormatError: no such folder, or no scene in it.
     """
     base = Path(root)
-    if not base.is_dir():
-        raise FormatError(base, "path", "no such folder", "a folder of RH20T scenes")
+    files.refuse_if(not base.is_dir(), base, "path", "no such folder", "a folder of RH20T scenes")
     scenes = list(_list_scenes(base, camera))[:limit]
     if not scenes:
         expected = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"

@@ -166,8 +166,13 @@ def _parse_shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]
         dimensions = tuple(int(size) for size in sizes)
     except (TypeError, ValueError):
         raise FormatError(file, f"{name} shape", sizes, "whole numbers") from None
-    if len(dimensions) > 8 or any(not -1 <= size <= files.MAX_PIXELS for size in dimensions):
-        raise FormatError(file, f"{name} shape", dimensions, "sizes of an array")
+    files.refuse_if(
+        len(dimensions) > 8 or any(not -1 <= size <= files.MAX_PIXELS for size in dimensions),
+        file,
+        f"{name} shape",
+        dimensions,
+        "sizes of an array",
+    )
     return dimensions
 
 
@@ -230,8 +235,9 @@ def _locate_episodes(root: Path, split: str | None, numbers: int | Sequence[int]
             if selected is None or i in selected
         ]
         n_before += len(places)
-    if not locations:
-        raise FormatError(root, "records", "none", "TFRecord files named <set>-<split>.tfrecord-<shard>-of-<shards>")
+    files.refuse_if(
+        not locations, root, "records", "none", "TFRecord files named <set>-<split>.tfrecord-<shard>-of-<shards>"
+    )
     return locations
 
 
@@ -304,8 +310,7 @@ def _open_camera(
     file, described = episode.file, features[depth] if depth else None
     images = _pictures(file, example, image)
     n = len(images)
-    if not 0 < n <= _MAX_EPISODE_STEPS:
-        raise FormatError(file, image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
+    files.refuse_if(not 0 < n <= _MAX_EPISODE_STEPS, file, image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
     depths = _depths(root, file, example, depth, described, (n, image)) if depth and described else ()
     h, w = (*(described.shape if described else ()), -1, -1)[:2]
     depth_hw, depth_camera = (h, w) if min(h, w) > 0 else None, None
@@ -357,8 +362,7 @@ def _depths(
     n, image = steps
     if described.kind == "image":
         spans = _pictures(file, example, key)
-        if len(spans) != n:
-            raise FormatError(file, key, f"{len(spans)} images", f"{n}, as many as {image}")
+        files.refuse_if(len(spans) != n, file, key, f"{len(spans)} images", f"{n}, as many as {image}")
         return spans
     shape, feature = described.shape, example.get(f"{_STEPS_FEATURE}/{key}")
     h, w = (*shape, 0, 0)[:2]
@@ -383,6 +387,5 @@ def _numbers(
         expected = " or ".join(map(str, sizes))
         raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
     values = tfrecord.read_feature_numbers(file, key, feature, n * size)
-    if len(values) != n * size:
-        raise FormatError(file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
+    files.refuse_if(len(values) != n * size, file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
     return values.reshape(n, size).astype(np.float64)

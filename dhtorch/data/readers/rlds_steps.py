@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data.codecs import tfrecord
-from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.decode import refuse_if
 from dhtorch.data.readers import rlds
 from dhtorch.data.recording import Recording
 
@@ -58,8 +58,13 @@ class EpisodeSteps:
                 readable[name] = feature
         for name, feature in readable.items():
             spans = example[f"{_STEPS}{name}"].spans
-            if feature.kind != "tensor" and len(spans) != n:
-                raise FormatError(load.place.file, name, f"{len(spans)} values", f"{n}, one a step")
+            refuse_if(
+                feature.kind != "tensor" and len(spans) != n,
+                load.place.file,
+                name,
+                f"{len(spans)} values",
+                f"{n}, one a step",
+            )
         return cls(load.place, n, readable, example)
 
     @property
@@ -97,8 +102,13 @@ class EpisodeSteps:
         """The numbers of all steps (n · size), decoded once and cached."""
         if name not in self.numbers:
             whole = tfrecord.read_feature_numbers(self.place.file, name, feature, size * self.n)
-            if len(whole) != size * self.n:
-                raise FormatError(self.place.file, name, f"{len(whole)} numbers", f"{size} for each of {self.n} steps")
+            refuse_if(
+                len(whole) != size * self.n,
+                self.place.file,
+                name,
+                f"{len(whole)} numbers",
+                f"{size} for each of {self.n} steps",
+            )
             self.numbers[name] = whole.astype(self.features[name].dtype)
         return self.numbers[name]
 

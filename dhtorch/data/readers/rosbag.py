@@ -90,8 +90,7 @@ def read(
     """
     root = Path(root)
     parts = list_bag_files(root) if root.is_dir() else [root]
-    if not parts:
-        raise FormatError(root, "files", "none", "one or more .mcap or .db3 files")
+    files.refuse_if(not parts, root, "files", "none", "one or more .mcap or .db3 files")
     bag = index_bag(root, parts)
     first, *others = _choose_pairs(bag, color, depth)
     recordings = [_open_pair(bag, first, K_options=(intrinsics, K, fov), use_poses=poses)]
@@ -137,8 +136,7 @@ def _choose_pairs(bag: BagIndex, color: str | None, depth: str | None) -> list[_
 def _candidates(bag: BagIndex, name: str | None, kind: str) -> list[ImageStream]:
     if name is not None:
         option = f"option {'color' if kind == 'colour' else kind}"
-        if name not in bag.streams:
-            raise FormatError(bag.root, option, name, f"one of {bag.format_topics()}")
+        files.refuse_if(name not in bag.streams, bag.root, option, name, f"one of {bag.format_topics()}")
         stream = bag.streams[name]
         if stream.kind != kind:
             actual = f"{name} of encoding {stream.encoding}"
@@ -188,8 +186,9 @@ def _open_pair(
     colour, depth = pair.colour, pair.depth
     hw, depth_hw = colour.hw, depth.hw
     option = intrinsics_options.parse_intrinsics(bag.root, hw, *K_options)
-    if option.feature is not None:
-        raise FormatError(bag.root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
+    files.refuse_if(
+        option.feature is not None, bag.root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
+    )
     camera, remarks = find_camera(bag, colour) if option.K is None else (None, [])
     if option.K is not None:
         camera = convert.to_camera(convert.make_K(*option.K), hw, bag.root, "option K")
@@ -343,6 +342,7 @@ class _Load:
                 return files.decode_image(bytes(packed.data), where, hw)
             return ros_images.decode_compressed_depth(bytes(packed.data), packed.format, self.metres, hw, where)
         image = parse_message(data, "Image", topic.coding, where)
-        if (image.height, image.width) != hw:
-            raise FormatError(where, "size", f"{image.width}x{image.height}", f"{hw[1]}x{hw[0]}")
+        files.refuse_if(
+            (image.height, image.width) != hw, where, "size", f"{image.width}x{image.height}", f"{hw[1]}x{hw[0]}"
+        )
         return ros_images.decode_depth(image, self.metres, where) if k else ros_images.decode_colour(image, where)

@@ -78,11 +78,11 @@ def read(
     """
     root = Path(root)
     episodes = _list_episodes(root)
-    if not episodes:
-        raise FormatError(root, "episodes", "none", "data/demo_<k> or traj_<k>")
+    files.refuse_if(not episodes, root, "episodes", "none", "data/demo_<k> or traj_<k>")
     cameras = [entry.name for entry in _list_cameras(root, episodes[0])]
-    if not cameras:
-        raise FormatError(root, episodes[0], "no camera with depth", "obs/<camera>_depth or sensor_data/<camera>/depth")
+    files.refuse_if(
+        not cameras, root, episodes[0], "no camera with depth", "obs/<camera>_depth or sensor_data/<camera>/depth"
+    )
     chosen = cameras if camera is None else [camera] if isinstance(camera, str) else list(camera)
     if unknown := [name for name in chosen if name not in cameras]:
         raise FormatError(root, "option camera", ", ".join(unknown), f"among {', '.join(cameras)}")
@@ -134,14 +134,14 @@ def _make_recording(
     n, hw = _check_shapes(arrays)
     info = _read_camera_info(file, episode, name)
     option = intrinsics_options.parse_intrinsics(file, hw, *K_options)
-    if option.feature is not None:
-        raise FormatError(file, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy")
+    files.refuse_if(
+        option.feature is not None, file, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
+    )
     if option.K is not None:
         camera = convert.to_camera(convert.make_K(*option.K), hw, file, "option K")
     elif arrays.K is not None:
         array = arrays.K
-        if array.shape[1:] != (3, 3):
-            raise FormatError(array.file, array.key, f"an array of {array.shape}", "steps x 3 x 3")
+        files.refuse_if(array.shape[1:] != (3, 3), array.file, array.key, f"an array of {array.shape}", "steps x 3 x 3")
         matrices = _to_pixel_centres(_read_rows(array, n))
         camera = convert.to_cameras(matrices, hw, array.file, array.key, None)
     elif "intrinsics" in info:
@@ -249,24 +249,41 @@ def _list_cameras(file: Path, episode: str) -> list[_Arrays]:
 def _check_shapes(arrays: _Arrays) -> tuple[int, tuple[int, int]]:
     """(steps, size of the pictures)."""
     image, depth = arrays.image, arrays.depth
-    if len(image.shape) != 4 or image.shape[3] not in (3, 4):
-        raise FormatError(image.file, image.key, f"an array of {image.shape}", "steps x height x width x 3")
-    if len(depth.shape) not in (3, 4) or (len(depth.shape) == 4 and depth.shape[3] != 1):
-        raise FormatError(depth.file, depth.key, f"an array of {depth.shape}", "steps x height x width x 1")
-    if depth.shape[0] != image.shape[0] or not image.shape[0]:
-        raise FormatError(depth.file, depth.key, f"{depth.shape[0]} steps", f"{image.shape[0]}, as of {image.key}")
-    if (
+    files.refuse_if(
+        len(image.shape) != 4 or image.shape[3] not in (3, 4),
+        image.file,
+        image.key,
+        f"an array of {image.shape}",
+        "steps x height x width x 3",
+    )
+    files.refuse_if(
+        len(depth.shape) not in (3, 4) or (len(depth.shape) == 4 and depth.shape[3] != 1),
+        depth.file,
+        depth.key,
+        f"an array of {depth.shape}",
+        "steps x height x width x 1",
+    )
+    files.refuse_if(
+        depth.shape[0] != image.shape[0] or not image.shape[0],
+        depth.file,
+        depth.key,
+        f"{depth.shape[0]} steps",
+        f"{image.shape[0]}, as of {image.key}",
+    )
+    files.refuse_if(
         0 in image.shape
         or 0 in depth.shape
-        or max(np.prod(image.shape[1:3]), np.prod(depth.shape[1:3])) > files.MAX_PIXELS
-    ):
-        raise FormatError(image.file, image.key, f"pictures of {image.shape[1:3]}", f"1 to {files.MAX_PIXELS} pixels")
+        or max(np.prod(image.shape[1:3]), np.prod(depth.shape[1:3])) > files.MAX_PIXELS,
+        image.file,
+        image.key,
+        f"pictures of {image.shape[1:3]}",
+        f"1 to {files.MAX_PIXELS} pixels",
+    )
     return image.shape[0], (image.shape[1], image.shape[2])
 
 
 def _read_rows(array: Hdf5Array, n: int) -> np.ndarray:
-    if array.shape[0] != n:
-        raise FormatError(array.file, array.key, f"{array.shape[0]} rows", f"{n}, one for each step")
+    files.refuse_if(array.shape[0] != n, array.file, array.key, f"{array.shape[0]} rows", f"{n}, one for each step")
     return array.values().astype(np.float64)
 
 
@@ -283,12 +300,12 @@ def _to_pixel_centres(K: Any) -> Any:
 def _read_poses(arrays: _Arrays, n: int, info: dict[str, Any]) -> Pose | None:
     """Camera-to-world of each step; None where the file has none."""
     if (gl := arrays.c2w_gl) is not None:
-        if gl.shape[1:] != (4, 4):
-            raise FormatError(gl.file, gl.key, f"an array of {gl.shape}", "steps x 4 x 4")
+        files.refuse_if(gl.shape[1:] != (4, 4), gl.file, gl.key, f"an array of {gl.shape}", "steps x 4 x 4")
         return convert.to_poses(convert.cv_from_gl(_read_rows(gl, n)), gl.file, gl.key)
     if (w2c := arrays.w2c) is not None:
-        if w2c.shape[1:] not in ((3, 4), (4, 4)):
-            raise FormatError(w2c.file, w2c.key, f"an array of {w2c.shape}", "steps x 3 x 4")
+        files.refuse_if(
+            w2c.shape[1:] not in ((3, 4), (4, 4)), w2c.file, w2c.key, f"an array of {w2c.shape}", "steps x 3 x 4"
+        )
         T = np.tile(np.eye(4), (n, 1, 1))
         T[:, :3] = _read_rows(w2c, n)[:, :3]
         poses = convert.to_poses(T, w2c.file, w2c.key)

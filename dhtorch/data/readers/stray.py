@@ -107,8 +107,7 @@ def read(
     report += missing
     if (root / "distortion").is_dir():
         report.append("distortion/ has lens tables of each frame: they are not applied")
-    if not shots:
-        raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
+    files.refuse_if(not shots, root, "frames", "; ".join(report) or "none", "rows with depth and pose")
     table = root / "camera_matrix.csv"
     lines = [line.replace(",", " ").split() for line in files.read_lines(table) if line.strip()]
     K = files.to_array(lines, (3, 3), table, "K")
@@ -207,8 +206,7 @@ class _Load:
 
     def _conf(self, file: Path) -> np.ndarray:
         conf = files.read_image(file, self.depth_hw)[0]  # some writers store three equal channels
-        if conf.max() > 2:
-            raise FormatError(file, "confidence", int(conf.max()), "0, 1 or 2")
+        files.refuse_if(conf.max() > 2, file, "confidence", int(conf.max()), "0, 1 or 2")
         return np.ascontiguousarray(conf)
 
 
@@ -223,25 +221,37 @@ def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
         raise FormatError(file, "table", error, "comma-separated columns") from None
     lines = [line for line in lines if any(line)]
     head = lines[0] if lines else []
-    if not set(_ODOMETRY_COLUMNS) <= set(head):
-        raise FormatError(file, "header", ", ".join(head) or "nothing", ", ".join(_ODOMETRY_COLUMNS))
+    files.refuse_if(
+        not set(_ODOMETRY_COLUMNS) <= set(head),
+        file,
+        "header",
+        ", ".join(head) or "nothing",
+        ", ".join(_ODOMETRY_COLUMNS),
+    )
     body, report = lines[1:], list[str]()
     if body and len(body[-1]) < len(head):
         body, report = body[:-1], ["the last row of odometry.csv is cut off: left out"]
     rows: list[_Row] = []
     for place, line in enumerate(body):
-        if len(line) != len(head):
-            raise FormatError(file, f"row {place}", f"{len(line)} columns", f"{len(head)}, as the header")
+        files.refuse_if(
+            len(line) != len(head), file, f"row {place}", f"{len(line)} columns", f"{len(head)}, as the header"
+        )
         cells = dict(zip(head, line, strict=True))
         number = cells["frame"]
-        if not (number.isascii() and number.isdigit() and len(number) <= 9):
-            raise FormatError(file, f"row {place} frame", number, "a frame number")
+        files.refuse_if(
+            not (number.isascii() and number.isdigit() and len(number) <= 9),
+            file,
+            f"row {place} frame",
+            number,
+            "a frame number",
+        )
         value = {
             name: _parse_number(cells[name], file, f"row {place} {name}")
             for name in _ODOMETRY_COLUMNS[:1] + _ODOMETRY_COLUMNS[2:]
         }
-        if not np.isfinite(value["timestamp"]):
-            raise FormatError(file, f"row {place} timestamp", cells["timestamp"], "a time in s")
+        files.refuse_if(
+            not np.isfinite(value["timestamp"]), file, f"row {place} timestamp", cells["timestamp"], "a time in s"
+        )
         t, q = (
             np.array([[value[name] for name in names]]) for names in (_ODOMETRY_COLUMNS[2:5], _ODOMETRY_COLUMNS[5:9])
         )
@@ -316,8 +326,7 @@ def _match_pictures(load: _Load, rows: list[_Row], lost_first: bool | None) -> t
         report += [f"{counts}: {choice}"] if choice else []
     picture = pairing.picture.tolist()
     shots = [replace(shot, picture=picture[shot.row.place]) for shot in load.shots if picture[shot.row.place] >= 0]
-    if not shots:
-        raise FormatError(load.video, "frames", f"{n} frames", "at least one with depth and pose")
+    files.refuse_if(not shots, load.video, "frames", f"{n} frames", "at least one with depth and pose")
     lost = [row.number for row in rows if picture[row.place] < 0]
     if lost:
         verb = "have" if len(lost) > 1 else "has"
