@@ -20,31 +20,25 @@ from dhtorch.data.corrections import Corrections
 from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file, describe_foreign_folder
 from dhtorch.data.io.decode import FormatError, refuse_if
 from dhtorch.data.readers import (
-    apc,
     arkitscenes,
     azure_kinect,
-    bop,
     ca1m,
     colmap,
     driving,
     frames_dir,
     lerobot,
     nerfstudio,
-    open3d,
     polycam,
     record3d,
     rectified,
-    replica,
     rh20t,
     rlds,
     rosbag,
-    scannet,
-    sens_folder,
     simulator_hdf5,
     stray,
-    sun3d,
     tum,
 )
+from dhtorch.data.readers.layouts import LAYOUTS
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.data.unread import report_unread
@@ -91,13 +85,7 @@ FORMATS: Final[dict[str, Reader]] = {
     "record3d": record3d,  # before tum: its folder holds rgb/ and depth/, too
     "polycam": polycam,
     "nerfstudio": nerfstudio,
-    "bop": bop,  # the image folders with a file that states their meaning: before those of names alone
-    "replica": replica,
-    "scannet": scannet,
-    "sens_folder": sens_folder,
-    "apc": apc,
-    "open3d": open3d,
-    "sun3d": sun3d,
+    **LAYOUTS,  # the image folders with a file that states their meaning: before those of names alone
     "tum": tum,
     "driving": driving,
     "rectified": rectified,
@@ -158,9 +146,9 @@ def open_all(
         format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
         follow_links: whether symbolic links inside the capture may point outside it.
         options: ``depth_unit``, ``pose_convention``, ``depth_lag`` and ``depth_turn`` of
-            :class:`dhtorch.data.corrections.Corrections`, and keyword options of the reader, see
-            ``dhtorch.data.<format>.read``. For formats without a stored K they include ``intrinsics``, ``K`` and
-            ``fov``, see :mod:`dhtorch.data.intrinsics`.
+            :class:`dhtorch.data.corrections.Corrections`, and keyword options of the format's ``read`` in
+            :mod:`dhtorch.data.readers`. For formats without a stored K they include ``intrinsics``, ``K`` and ``fov``,
+            see :mod:`dhtorch.data.intrinsics`.
 
     Returns:
         One recording for each camera (and episode), at least one; formats with up to tens of thousands of recordings

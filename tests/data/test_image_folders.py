@@ -249,7 +249,7 @@ CASES = [
     Case("sens folder without unit", sens, 2, [("_info.txt", [("m_depthShift = 1000\n", "")])],
          {"unit": (1 / 1000, None), "same": ([0, 1], 1e-3)}),
     Case("sens folder, no number", sens, 2, [("_info.txt", [("m_depthShift = 1000", "m_depthShift = many")])],
-         error=r"_info.txt: m_depthShift: found many, expected a number"),
+         error=r"_info.txt: m_depthShift: found 'many', expected a finite number"),
     Case("sens folder, K of twice the size", sens, 1,
          [("_info.txt", [("m_colorWidth = 64", "m_colorWidth = 32"), ("m_colorHeight = 48", "m_colorHeight = 24")])],
          {"f": pytest.approx([123, 116.5]), "c": pytest.approx([67.5, 44]), "report": [r"states K for 32x24: K is scaled"]}),

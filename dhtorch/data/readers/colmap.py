@@ -15,7 +15,7 @@ from pathlib import Path
 from dhtorch.data.codecs.colmap import parse_id, parse_numbers, read_colmap_cameras, read_colmap_images
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.posed_images import PosedImage, format_names_left_out, open_posed_images
+from dhtorch.data.readers.image_folders import FrameFiles, format_names_left_out, open_posed
 from dhtorch.data.recording import Recording
 
 #: Files of the format that are not read: points and their tracks, rigs, settings of COLMAP.
@@ -80,7 +80,8 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
         lens = lenses[entry.camera_id]
         candidates = (maps / f"{stem}{suffix}" for stem in (image.stem, image.name) for suffix in _DEPTH_SUFFIXES)
         rows.append(
-            PosedImage(
+            FrameFiles(
+                number=-1,
                 image=image,
                 depth=next((each for each in candidates if each.is_file()), None),
                 K=lens.K,
@@ -95,7 +96,7 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
     head = files.read_lines(model / "images.txt")[:10]
     if not any(text.startswith("#") and "metres" in text for text in head):
         report.append("poses were estimated by COLMAP: their scale is not metric unless it was aligned")
-    return [open_posed_images(root, "colmap", rows, unit=None, report=report)]
+    return [open_posed(root, "colmap", rows, unit=None, report=report)]
 
 
 def _find_model(root: Path) -> Path | None:

@@ -29,12 +29,12 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.image_table import (
-    ImageRow,
-    ImageTableLoader,
+from dhtorch.data.readers.image_folders import (
+    FrameFiles,
+    FrameLoader,
     list_images,
     parse_option,
-    read_depth_hw,
+    read_depth_type,
     read_K,
     read_pose,
     read_stored_sizes,
@@ -117,7 +117,7 @@ def read(
     meta = files.read_json(side_car) if side_car.is_file() else {}
     frames, poses, report = _list_frames(root)
     hw = files.read_image_header(frames[0].image).hw
-    depth_hw = read_depth_hw(frames[0].depth)
+    depth_hw = read_depth_type(frames[0].depth)[0]
     stated = parse_option(root, hw, intrinsics, K, fov)
     colour_K = _read_intrinsics(root, "K", stated.K, meta)
     if colour_K is None:
@@ -142,7 +142,7 @@ def read(
         rows = files.to_array(meta["K_frames"], (len(frames), 4), side_car, "K_frames")
         cameras = [convert.to_camera(convert.make_K(*row), hw, side_car, "K_frames", lens) for row in rows]
         frames = [replace(frame, camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
-    load = ImageTableLoader(
+    load = FrameLoader(
         rows=tuple(frames),
         hw=hw,
         depth_hw=depth_hw,
@@ -180,13 +180,13 @@ def _find_image_folder(root: Path) -> Path | None:
     return next((root / name for name in _IMAGE_FOLDERS if list_images(root / name)), None)
 
 
-def _single(root: Path) -> ImageRow | None:
+def _single(root: Path) -> FrameFiles | None:
     image = _first_existing(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
     depth, K = root / "raw_depth.png", root / "intrinsics.txt"
-    return ImageRow(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
+    return FrameFiles(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
 
 
-def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
+def _list_frames(root: Path) -> tuple[list[FrameFiles], Pose | None, list[str]]:
     """(frames, poses or None, report of what was left out) of the layout that ``root`` has."""
     if (pictures := _find_image_folder(root)) is not None or (root / "images").is_dir():
         folder = pictures or root / "images"
@@ -210,7 +210,7 @@ def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
         values = [int(m[1]) for m in digits if m]
         increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
         numbers = values if increasing else range(len(stems))
-        frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
+        frames = [FrameFiles(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
         folders = [root / name for name in _POSE_FOLDERS]
         has_file = (each for each in folders if any((each / f"{stem}.txt").is_file() for stem in stems))
         source = file or next(has_file, None)
@@ -228,7 +228,7 @@ def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
     return ([single], None, ["no poses in this layout"]) if single is not None else _list_named_frames(root)
 
 
-def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
+def _list_named_frames(root: Path) -> tuple[list[FrameFiles], Pose | None, list[str]]:
     parts: dict[int, dict[str, Path]] = {}
     for file in root.iterdir() if root.is_dir() else ():
         if match := _NAMED_FRAME_PATTERN.fullmatch(file.name):
@@ -247,7 +247,7 @@ def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[st
             if matrix.shape != (4, 4):
                 raise FormatError(files_of["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
             poses.append(matrix)
-            frames.append(ImageRow(number, files_of["color"], files_of["depth"]))
+            frames.append(FrameFiles(number, files_of["color"], files_of["depth"]))
     if not frames:
         problem = f"none complete among {len(parts)}" if parts else "none"
         expected = "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt"

@@ -26,7 +26,7 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.posed_images import PosedImage, format_names_left_out, open_posed_images
+from dhtorch.data.readers.image_folders import FrameFiles, format_names_left_out, open_posed
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
@@ -77,7 +77,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     meta = files.read_json(file)
     folder = file.parent
     undo, report = _parse_applied(meta, file)
-    rows: dict[PurePosixPath, list[PosedImage]] = {}
+    rows: dict[PurePosixPath, list[FrameFiles]] = {}
     missing: list[Path] = []
     for k, entry in enumerate(files.get_entry(meta, "frames", list, file)):
         if not isinstance(entry, dict):
@@ -108,7 +108,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
         unit = DepthUnit(files.to_positive(meta[stating], file, stating), f"{file.name}: {stating}")
     name = folder.resolve().name
     return [
-        open_posed_images(
+        open_posed(
             root,
             "nerfstudio",
             images,
@@ -144,12 +144,13 @@ def _resolve(folder: Path, name: str, file: Path, field: str) -> Path:
 
 def _parse_row(
     meta: Mapping[str, Any], entry: Mapping[str, Any], image: Path, undo: np.ndarray, file: Path, k: int
-) -> PosedImage:
+) -> FrameFiles:
     K, hw, distortion = parse_lens({**meta, **entry}, image, file, k)
     depth_name = next((entry[key] for key in _DEPTH_KEYS if isinstance(entry.get(key), str)), None)
     depth = None if depth_name is None else _resolve(file.parent, depth_name, file, f"frames.{k}.depth_file_path")
     time, origin = entry.get("timestamp"), entry.get(_ORIGIN_KEY)
-    return PosedImage(
+    return FrameFiles(
+        number=-1,
         image=image,
         depth=depth if depth is not None and depth.is_file() else None,
         K=K,

@@ -16,8 +16,7 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.image_table import list_images
-from dhtorch.data.readers.posed_images import PosedImage, open_posed_images
+from dhtorch.data.readers.image_folders import FrameFiles, list_images, open_posed
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
@@ -70,7 +69,7 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
     )
     report += files.format_left_out([name for name in sources if name not in pictures], f"no file in {images}/")
     return [
-        open_posed_images(
+        open_posed(
             root,
             "polycam",
             rows,
@@ -92,7 +91,7 @@ def _find_folders(root: Path) -> tuple[Path, tuple[str, str]] | None:
     return None
 
 
-def _parse_row(source: Path, number: int, image: Path, depth: Path | None, conf: Path | None) -> PosedImage:
+def _parse_row(source: Path, number: int, image: Path, depth: Path | None, conf: Path | None) -> FrameFiles:
     camera = files.read_json(source)
     fx, fy, cx, cy, width, height = (
         files.to_positive(files.get_entry(camera, name, (int, float), source), source, name)
@@ -101,7 +100,7 @@ def _parse_row(source: Path, number: int, image: Path, depth: Path | None, conf:
     rows = [[files.get_entry(camera, f"t_{i}{j}", (int, float), source) for j in range(4)] for i in range(3)]
     c2w = np.vstack((files.to_array(rows, (3, 4), source, "t_00 to t_23"), [0.0, 0.0, 0.0, 1.0]))
     stamp = camera.get("timestamp", int(image.stem) if image.stem.isdecimal() else None)
-    return PosedImage(
+    return FrameFiles(
         image=image,
         depth=depth,
         K=convert.make_K(fx, fy, cx, cy),

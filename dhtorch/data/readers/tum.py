@@ -25,7 +25,7 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import image_table
+from dhtorch.data.readers import image_folders
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera
@@ -141,20 +141,20 @@ def read(
         if is_y_up:
             c2w = _FLIP_Y @ c2w @ _FLIP_Y
     rows = tuple(
-        image_table.ImageRow(int(t) if is_numbered else i, colour[i][1], depth[j][1])
+        image_folders.FrameFiles(int(t) if is_numbered else i, colour[i][1], depth[j][1])
         for (i, j), t in zip(pairs, times, strict=True)
     )
-    load = image_table.ImageTableLoader(
+    load = image_folders.FrameLoader(
         rows=rows,
         hw=hw,
-        depth_hw=image_table.read_depth_hw(rows[0].depth),
+        depth_hw=image_folders.read_depth_type(rows[0].depth)[0],
         camera=lens,
         units_per_metre=1 / unit.metres,
     )
     has_times = not is_numbered or data_set == "ICL-NUIM"
     if not has_times:
         report.append("images are numbered, not stamped: no times")
-    load, stored = image_table.read_stored_sizes(load)
+    load, stored = image_folders.read_stored_sizes(load)
     return [
         Recording(
             name=root.resolve().name,
@@ -211,7 +211,7 @@ def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool
             place = next((i for i, word in enumerate(words) if Path(word).parent.name == kind), usual)
             rows.append((joint, line, list(words[max(place - 1, 0) : place + 1])))
     else:
-        pictures = image_table.list_images(root / kind)
+        pictures = image_folders.list_images(root / kind)
         rows = [(root / kind, i, [stem, f"{kind}/{pictures[stem].name}"]) for i, stem in enumerate(pictures)]
     by_stamp: dict[float, Path] = {}
     for file, line, words in rows:
@@ -298,7 +298,7 @@ def _find_camera(
     elif calibration is not None and camera is None and intrinsics == "camera":
         (values, distortion), place, field = _read_calibration(calibration), calibration, "fx fy cx cy"
     elif is_icl:
-        matrix, scaled = image_table.fit_K(convert.make_K(*_ICL_INTRINSICS), _IMAGE_HW, hw, Path("ICL-NUIM"))
+        matrix, scaled = image_folders.fit_K(convert.make_K(*_ICL_INTRINSICS), _IMAGE_HW, hw, Path("ICL-NUIM"))
         return convert.to_camera(matrix, hw, root), (*scaled, *report), data_set, True
     elif number is not None or intrinsics != "camera":
         if hw != _IMAGE_HW:
