@@ -11,10 +11,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from dhtorch.data import convert
 from dhtorch.data.io.decode import FormatError, refuse_if, to_array
+from dhtorch.records import Camera
 
 #: Options of every reader whose captures may lack a K; unset (None), they are ignored by all other readers.
 INTRINSICS_OPTIONS = ("intrinsics", "K", "fov")
@@ -54,11 +57,14 @@ def parse_intrinsics(
     intrinsics: IntrinsicsOption | None = None,
     K: Sequence[float] | None = None,
     fov: float | None = None,
+    *,
+    features: bool = True,
 ) -> ParsedIntrinsics:
     """The three options and the image size ``hw`` → intrinsics of a camera; warns where K is a guess.
 
     Raises:
-        FormatError: more than one option, an angle outside 1 to 179°, or not four numbers.
+        FormatError: more than one option, an angle outside 1 to 179°, not four numbers, or the name of a feature where
+            the format has no ``features``.
     """
     stated = {
         name: value for name, value in zip(INTRINSICS_OPTIONS, (intrinsics, K, fov), strict=True) if value is not None
@@ -68,6 +74,8 @@ def parse_intrinsics(
     refuse_if(len(stated) > 1, root, "options", " and ".join(f"data.{name}" for name in stated), "one of them")
     ((name, value),) = stated.items()
     if isinstance(value, str):
+        expected = "fx fy cx cy, or degrees (the format has no features)"
+        refuse_if(not features, root, "option intrinsics", value, expected)
         return ParsedIntrinsics(feature=value)
     if isinstance(value, int | float) and name != "K":
         # Horizontal field of view in degrees → fx, fy, cx, cy in px, square pixels around the image centre
@@ -81,6 +89,13 @@ def parse_intrinsics(
         warnings.warn(f"{root.resolve().name}: {report}", stacklevel=2)
         return ParsedIntrinsics(numbers, report=(report,))
     return ParsedIntrinsics(tuple(to_array(value, (4,), root, f"option {name}").tolist()))
+
+
+def parse_camera(root: Path, hw: tuple[int, int], *options: Any) -> tuple[Camera | None, tuple[str, ...]]:
+    """The three options of a format without features → the camera that they set, if any, and the report."""
+    option = parse_intrinsics(root, hw, *options, features=False)
+    camera = None if option.K is None else convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
+    return camera, option.report
 
 
 def find_guess_report(report: Sequence[str]) -> str | None:

@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 from support import writers
 from support.arkitscenes_frames import VGA, VGA_HW, path, shots
-from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
+from support.box_scene import CAMERA, HW, disagreement, off_wall, render, world_points
 from support.capture_cases import DELETE, Case, check_case, edit_files
 
 from dhtorch import data
@@ -24,9 +24,8 @@ from dhtorch.data import FormatError, clocks, convert
 from dhtorch.data.readers import arkitscenes, ca1m
 from dhtorch.experiments.protocol import PairDataset
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Frame, Pose
 
 
 def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
@@ -39,28 +38,6 @@ def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
 
 def stored(root: Path, **options: object) -> data.Recording:
     return data.open(root, "arkitscenes", upright=False, **options)
-
-
-def test_gives_back_the_scene(tmp_path: Path) -> None:
-    frames = capture(tmp_path / "47333462")
-    assert data.recognise(tmp_path / "47333462")[0] == "arkitscenes"
-    recording = data.open(tmp_path / "47333462")
-    assert recording.name == "47333462" and recording.report == () and recording.number.tolist() == [0, 1, 2, 3]
-    assert recording.rate_hz == pytest.approx(60, rel=0.03)
-    assert recording.times.tolist() == [100.0, 100.017, 100.033, 100.05]  # the names carry milliseconds
-    check_same(recording, frames, 1 / 1000)
-    for i, want in enumerate(frames):
-        assert recording[i].depth_camera is None and torch.equal(recording[i].conf, want.conf)
-    assert not hasattr(recording, "truth")
-
-
-def test_world_to_camera_read_as_its_inverse_would_show(tmp_path: Path) -> None:
-    capture(tmp_path / "1", n=8)
-    recording = data.open(tmp_path / "1")
-    wrong = se3.invert(recording.poses)
-    assert disagreement(recording[0], recording[7])[0] < 0.01
-    a, b = (recording[i].replace(T_world_from_cam=wrong[i : i + 1]) for i in (0, 7))
-    assert disagreement(a, b)[0] > 0.03
 
 
 def test_larger_pictures_find_depth_and_pose_at_other_clocks(tmp_path: Path) -> None:
@@ -104,10 +81,18 @@ def write_wide(root: Path, frames: list[Frame], *, name: str) -> None:
     writers.write_arkitscenes(root / "1", {name: wide, "lowres_depth": frames}, trajectory=frames)
 
 
+def write_3dod(root: Path, frames: list[Frame]) -> None:
+    """The frames one folder further down."""
+    inner = root / MIXED / "42445173_frames"
+    writers.write_arkitscenes(inner, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
+
+
 def without(rows: tuple[int, ...]) -> Any:
     return lambda text: "\n".join(row for i, row in enumerate(text.splitlines()) if i not in rows)
 
 
+MIXED = "3dod/Validation/42445173"
+DOWN = Pose(torch.tensor([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]]).double(), torch.zeros(1, 3).double())
 TRAJ = "1/lowres_wide.traj"
 STORED = {"format": "arkitscenes", "upright": False}
 WIDE = cameras.resize(VGA, VGA_HW, (192, 256)).f[0].tolist()
@@ -126,6 +111,15 @@ def all_vga() -> dict[str, list[Frame]]:
 
 
 CASES = [
+    arkit("whole", at(4), (), {"format": "arkitscenes", "report": (), "number": [0, 1, 2, 3],
+                               "rate": pytest.approx(60, rel=0.03), "truth": False, "depth f": None,
+                               "times": [100.0, 100.017, 100.033, 100.05],  # the names carry milliseconds
+                               "same": ([0, 1, 2, 3], 1e-3, 1.0, True)}),
+    *(Case(f"3dod keeps its frames one folder down, {path}", write_3dod, at(3, 10), [(f"{MIXED}/a.json", "{}")],
+           {"format": "arkitscenes", "number": [0, 1, 2]}, path=path) for path in (MIXED, f"{MIXED}/42445173_frames")),
+    arkit("a camera that looks straight down", lambda: [render(CAMERA, DOWN, HW, 100.0)], (),
+          {"hw": HW, "report": ["no confidence", "the camera looks straight up or down: images are not rotated"]},
+          options={"upright": True}),
     *(arkit(f"{name} is wide", at(3, 10), (), {"f": pytest.approx(WIDE), "report": ()}, write=write_wide,
             written={"name": name}) for name in ("wide", "color")),
     *(arkit(f"intrinsics of {name} are borrowed", at(3, 10), [(f"1/{name}_intrinsics/*", DELETE)],
@@ -208,17 +202,6 @@ def test_downloads_complete_each_other(tmp_path: Path) -> None:
     elsewhere = tmp_path / "42"  # not where the download puts it: nothing beside it is read
     up.rename(elsewhere)
     assert stored(elsewhere).poses is None
-
-
-def test_3dod_keeps_its_frames_one_folder_down(tmp_path: Path) -> None:
-    root = tmp_path / "3dod" / "Validation" / "42445173"
-    frames = shots(100 + np.arange(3) / 10)
-    inner = root / "42445173_frames"
-    writers.write_arkitscenes(inner, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
-    (root / "42445173_3dod_annotation.json").write_text("{}")
-    for place in (root, inner):
-        recording = data.open(place, upright=False)
-        assert recording.name == "42445173" and recording.format == "arkitscenes" and len(recording) == 3
 
 
 def test_a_gap_is_bridged_by_interpolation_and_one_pose_serves_the_images_near_it(tmp_path: Path) -> None:
@@ -325,31 +308,6 @@ def test_pictures_are_turned_upright_by_the_poses(tmp_path: Path, turns: int) ->
     assert stored(root)[0].hw == HW
 
 
-def test_looking_straight_down_names_no_side(tmp_path: Path) -> None:
-    root = tmp_path / "1"
-    down = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=torch.float64)[None]
-    frame = render(CAMERA, Pose(down, torch.zeros(1, 3, dtype=torch.float64)), HW, 100.0)
-    writers.write_arkitscenes(root, {"lowres_wide": [frame], "lowres_depth": [frame]}, trajectory=[frame])
-    recording = data.open(root)
-    assert recording[0].hw == HW
-    assert "the camera looks straight up or down: images are not rotated" in recording.report
-
-
-def test_turning_a_lens_keeps_every_ray() -> None:
-    lens = Camera(CAMERA.f.double(), CAMERA.c.double(), torch.tensor([[0.1, -0.05, 0.01, -0.02, 0.03]]).double())
-    xyz = torch.tensor([[[0.3, -0.2, 1.5], [-0.4, 0.1, 1.2], [0.0, 0.5, 2.0]]]).double()
-    uv = cameras.project(lens, xyz)[0]
-    for turns, turned in ((1, (HW[0] - 1 - uv[:, 1], uv[:, 0])), (2, (HW[1] - 1 - uv[:, 0], HW[0] - 1 - uv[:, 1]))):
-        pose = torch.from_numpy(convert.rot90_pose(np.eye(4)[None], turns))
-        seen = se3.apply(se3.invert(se3.from_matrix(pose)), xyz)
-        got = cameras.project(convert.rot90_camera(lens, HW, turns), seen)[0]
-        torch.testing.assert_close(got, torch.stack(turned, -1), atol=1e-9, rtol=0)
-        picture = torch.arange(HW[0] * HW[1]).view(HW)
-        assert convert.rot90_image(picture, turns)[5, 7] == (
-            picture[HW[0] - 1 - 7, 5] if turns == 1 else picture[HW[0] - 1 - 5, HW[1] - 1 - 7]
-        )
-
-
 def test_laser_depth_is_taken_to_the_images_pixels(tmp_path: Path) -> None:
     root = tmp_path / "1"
     laser_camera = cameras.resize(VGA, VGA_HW, (192, 256))
@@ -358,7 +316,7 @@ def test_laser_depth_is_taken_to_the_images_pixels(tmp_path: Path) -> None:
     writers.write_arkitscenes(
         root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
     )
-    recording = stored(root)
+    recording = pickle.loads(pickle.dumps(stored(root)))
     assert len(recording) == 13
     exact = recording.truth(6)  # same instant, another camera: half a laser pixel on a slanted wall
     want = frames[6].depth
@@ -409,18 +367,6 @@ def test_laser_truth_enters_the_main_job(tmp_path: Path) -> None:
     assert (holdout.sample_truth(reference, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
     found = holdout.sample_truth(exact, uv, truth="full")
     assert found.ok.all() and float((found.depth - 1.8).abs().max()) < 0.1
-
-
-def test_opening_decodes_nothing_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture(tmp_path / "1", highres_depth=shots([100.0], VGA, VGA_HW))
-    decoded = []
-    decode = cv2.imdecode
-    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or decode(*args))
-    recording = data.open(tmp_path / "1")
-    assert decoded == []
-    twin = pickle.loads(pickle.dumps(recording))
-    assert torch.equal(twin[2].depth, recording[2].depth) and len(decoded) == 6
-    assert torch.equal(twin.truth(0)["depth"], recording.truth(0)["depth"])
 
 
 def test_other_folders_are_not_taken_for_captures(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ import pytest
 import torch
 from support.box_scene import walk
 from support.byte_damage import overwrite
+from support.writers.parts import write_video
 from support.writers.rosbag import BagLayout, write_rosbag
-from support.writers.video import write_video
 
 from dhtorch import data
 from dhtorch.data.codecs import exr as codec_exr

@@ -20,7 +20,7 @@ from support import damage_harness as hostile
 from support import writers
 from support.box_scene import walk
 from support.byte_damage import STRANGE_FILES
-from support.writers.video import write_video
+from support.writers.parts import write_video
 
 from dhtorch import data
 from dhtorch.data.codecs import hdf5, npy, parquet, pickles, tarballs, tiff, video

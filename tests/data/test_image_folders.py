@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,19 @@ def with_confidence(frames: list[Frame]) -> list[Frame]:
 
 
 @pytest.mark.parametrize("name", writers.CAPTURE_WRITERS)
-def test_every_layout_gives_back_the_scene(tmp_path: Path, name: str) -> None:
-    """Whole, with its unit and no file unread; layouts of JPEGs, films or depth in metres nearly so."""
+def test_every_layout_gives_back_the_scene(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whole, with its unit and no file unread; layouts of JPEGs, films or depth in metres nearly so.
+
+    Opening decodes nothing (but the first map of SUN3D, whose codes may be rotated), and recordings can be pickled.
+    """
     writer, frames = writers.CAPTURE_WRITERS[name], with_confidence(walk(3))
-    recording = turned_back(data.open(writer(tmp_path, frames), **writer.options), writer.up)
+    path = writer(tmp_path, frames)
+    with monkeypatch.context() as patch:
+        for decoder in () if name == "sun3d" else ("cv2.imdecode", "lzfse.decompress"):
+            patch.setattr(decoder, lambda *_: pytest.fail("opening decodes an image or a depth map"))
+        patch.setattr("dhtorch.data.codecs.video._Decoder.frame", lambda *_: pytest.fail("opening decodes a film"))
+        recording = data.open(path, **writer.options)
+    recording = turned_back(pickle.loads(pickle.dumps(recording)), writer.up)
     assert recording.format == writer.format and len(recording) == 3
     assert not [line for line in recording.report if line.startswith("not read")]
     if writer.step_m is not None and recording.depth_unit is not None:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.box_scene import CAMERA, HW, off_wall, pose, render, world_points
-from support.capture_cases import DELETE, Case, check_case
+from support.box_scene import CAMERA, HW, pose, render
+from support.capture_cases import DELETE, Case, check_case, check_frames
 from support.robot_episodes import two_episodes
 
 pytest.importorskip("av")
@@ -24,7 +24,7 @@ import av
 import pyarrow
 from pyarrow import parquet
 from support.writers.lerobot import quantise_lerobot_depth, write_lerobot
-from support.writers.video import write_video
+from support.writers.parts import write_video
 
 from dhtorch import data
 from dhtorch.cli import run
@@ -47,42 +47,12 @@ def _clean() -> Iterator[None]:
     close_videos()
 
 
-def same_scene(recording: data.Recording, frames: list[Frame], step: float) -> None:
-    assert len(recording) == len(frames) and recording.report == ()
-    for frame, want in zip(recording, frames, strict=True):
-        assert torch.equal(frame.image, want.image)
-        torch.testing.assert_close(frame.depth, want.depth, atol=step / 2 + 1e-6, rtol=0)
-        assert torch.equal(frame.camera.f, want.camera.f) and torch.equal(frame.camera.c, want.camera.c)
-        torch.testing.assert_close(frame.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
-        torch.testing.assert_close(frame.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
-        torch.testing.assert_close(frame.time, want.time, atol=1e-9, rtol=0)
-        assert float(off_wall(world_points(frame)).max()) < 2 * step
-
-
 # ------------------------------------------------------------------------------------------------ written, then read
-
-
-@pytest.mark.parametrize("version", [3, 2])
-@pytest.mark.parametrize(
-    ("image", "depth", "intrinsics"),
-    [("video", "video", "feature"), ("image", "tiff", "side-car"), ("video", "png", "feature"), ("image", "array", "feature")],
-)  # fmt: skip
-def test_gives_back_the_scene(tmp_path: Path, version: int, image: str, depth: str, intrinsics: str) -> None:
-    shots = two_episodes()
-    write_lerobot(tmp_path, shots, version=version, image=image, depth=depth, intrinsics=intrinsics)
-    assert data.recognise(tmp_path)[0] == "lerobot"
-    recordings = data.open_all(tmp_path)
-    assert [r.name for r in recordings] == [f"{tmp_path.name}/episode_{i:06d}/front" for i in range(2)]
-    for recording, frames in zip(recordings, shots, strict=True):
-        same_scene(recording, frames, STEP[depth])
-        assert recording.rate_hz == 30 and len(pickle.dumps(recording)) < 20_000
-    backwards = [recordings[1][i].image for i in (3, 0, 2)]
-    assert all(torch.equal(got, shots[1][i].image) for got, i in zip(backwards, (3, 0, 2), strict=True))
 
 
 def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
     write_lerobot(tmp_path, two_episodes())
-    same_scene(data.open(tmp_path, episode=1, camera=KEY), two_episodes()[1], STEP["video"])
+    check_frames(data.open(tmp_path, episode=1, camera=KEY), two_episodes()[1], STEP["video"], exact=True)
     assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
 
 
@@ -111,7 +81,7 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
     recordings = data.open_all(tmp_path)
     assert opened == []
     assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
-    same_scene(recordings[-1], two_episodes()[1], STEP["video"])
+    check_frames(recordings[-1], two_episodes()[1], STEP["video"], exact=True)
     assert data.open_capture(tmp_path, gap=3)[-1].gap == 3 and 1 <= len(opened) <= 4
     assert recordings[n - 1].name == recordings.names[-1]
     assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
@@ -241,23 +211,6 @@ def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 # -------------------------------------------------------------------------------------------------- intrinsics, depth
 
 
-def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, [two_episodes()[0]], version=2)
-    info = tmp_path / "meta" / "info.json"
-    said = json.loads(info.read_text())
-    for ending in ("", ".intrinsics"):
-        if KEY + ending in said["features"]:
-            said["features"]["observation.images.left" + ending] = said["features"][KEY + ending]
-    info.write_text(json.dumps(said))
-    (film,) = (tmp_path / "videos").rglob(f"*{KEY}/*.mp4")
-    copy = film.parent.parent / "observation.images.left" / film.name
-    copy.parent.mkdir()
-    copy.write_bytes(film.read_bytes())
-    both = data.open_all(tmp_path, camera=["observation.images.left", KEY], K=[60, 60, 30, 20])
-    assert [r.name.rpartition("/")[2] for r in both] == ["left", "front"]
-    assert torch.equal(both[0][0].image, both[1][0].image)
-
-
 # ------------------------------------------------------------------------------------------------------- rows and time
 
 
@@ -335,18 +288,6 @@ def test_a_capture_keeps_its_clock_where_that_increases(monkeypatch, written, nu
     assert found[0].tolist() == numbers and (found[1] is None if times is None else found[1].tolist() == times)
 
 
-def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_lerobot(tmp_path, two_episodes(), image="image", depth="tiff")
-    asked: list[str] = []
-    read = codec_parquet.read_columns
-    monkeypatch.setattr(codec_parquet, "read_columns", lambda f, c, rows: asked.extend(c) or read(f, c, rows))
-    recording = data.open(tmp_path, episode=1)
-    assert KEY not in asked
-    for frame in recording:
-        assert frame.depth.any()
-    assert asked.count(KEY) == 2 == asked.count(f"{KEY}_depth")  # four rows in two row groups
-
-
 INFO, SIDE = "meta/info.json", "meta/intrinsics.json"
 TABLE = "data/chunk-000/episode_000001.parquet"
 DEPTH = f"{KEY}_depth"
@@ -357,6 +298,27 @@ def write_both(root: Path, _frames: list[Frame], **options: Any) -> None:
     write_lerobot(root, two_episodes(), **options)
 
 
+def write_left(root: Path, frames: list[Frame], **options: Any) -> None:
+    """A set with the films of another camera."""
+    write_both(root, frames, **options)
+    shutil.copytree(root / "videos/chunk-000" / KEY, root / "videos/chunk-000/observation.images.left")
+
+
+def declare(name: str) -> tuple[str, Any]:
+    """An edit of the features: another camera like the first."""
+
+    def change(text: str) -> str:
+        info = json.loads(text)
+        info["features"] |= {
+            key.replace("front", name): info["features"][key]
+            for key in (KEY, f"{KEY}.intrinsics")
+            if key in info["features"]
+        }
+        return json.dumps(info)
+
+    return INFO, change
+
+
 def lenses() -> list[Frame]:
     """Frames of cameras that change."""
     return [render(Camera(CAMERA.f + i, CAMERA.c), pose(i), HW, i / 30) for i in range(3)]
@@ -364,7 +326,7 @@ def lenses() -> list[Frame]:
 
 def set_case(name: str, edits: Any = (), expect: Any = None, *, frames: Any = FIRST, **more: Any) -> Case:
     options = {"episode": 1 if frames is SECOND else 0} | more.pop("options", {})
-    return Case(name, write_both, frames, edits, expect or {}, options=options, **more)
+    return Case(name, more.pop("write", write_both), frames, edits, expect or {}, options=options, **more)
 
 
 def feature(key: str, **change: Any) -> tuple[str, Any]:
@@ -389,6 +351,19 @@ WRIST = {"dtype": "image", "shape": [*HW, 3], "info": {}}
 V2 = {"version": 2}
 
 CASES = [
+    *(set_case(f"version {version}, {image}, {depth}", (), {
+        "name": f"episode_{episode:06d}/front", "report": (), "rate": 30,
+        "times of": [round(i / 30, 6) for i in range(n)], "same": (list(range(n)), STEP[depth], 1.0, True)},
+               frames=frames, written={"version": version, "image": image, "depth": depth, "intrinsics": intrinsics})
+      for image, depth, intrinsics in (("video", "video", "feature"), ("image", "tiff", "side-car"),
+                                       ("video", "png", "feature"), ("image", "array", "feature"))
+      for version in (2, 3) for episode, n, frames in ((0, 2, FIRST), (1, 4, SECOND))),
+    set_case("a camera that is only declared", [declare("ghost")], {"name": "episode_000000/front"}, written=V2),
+    set_case("a camera that is only declared, by name", [declare("ghost")], written=V2,
+             options={"camera": "observation.images.ghost"}, error="ghost"),
+    *(set_case(f"{camera} of two cameras", [declare("left")], {"name": f"episode_000000/{camera}"}, which=place,
+               written=V2, options={"camera": ["observation.images.left", KEY], "K": [60, 60, 30, 20]}, write=write_left)
+      for place, camera in enumerate(("left", "front"))),
     *(set_case(f"codes in {pixels}", (), ALL, written={"depth_pixels": pixels})
       for pixels in ("gray12le", "yuv420p12le")),
     set_case("the older flag of depth", [odd_tracks({"is_depth_map": DELETE, "video.is_depth_map": True})], ALL),
@@ -510,17 +485,6 @@ def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: 
     for i, shot in enumerate(shots):
         assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5
     assert recording.times is not None and float(recording.times[0]) == 0
-
-
-def test_a_camera_that_is_only_declared_is_none(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, [two_episodes()[0]], version=2)
-    info = tmp_path / "meta" / "info.json"
-    said = json.loads(info.read_text())
-    said["features"]["observation.images.ghost"] = said["features"]["observation.images.front"]
-    info.write_text(json.dumps(said))
-    assert len(data.open_all(tmp_path)) == 1
-    with pytest.raises(FormatError):
-        data.open_all(tmp_path, camera="observation.images.ghost")[0][0]
 
 
 def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.writers.video import write_video
+from support.writers.parts import write_video
 from torch import Tensor
 
 from dhtorch import data

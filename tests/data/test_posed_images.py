@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -11,37 +12,16 @@ import pytest
 import torch
 from PIL import Image
 from support.box_scene import walk
-from support.capture_cases import DELETE, Case, check_case, check_frames, edit_files
+from support.capture_cases import DELETE, Case, check_case, check_frames
 from support.writers import write_colmap_capture, write_counted_frames, write_nerfstudio, write_polycam
-from support.writers.parts import encode_unfiltered_png
 
 from dhtorch import data
-from dhtorch.data.io.decode import FormatError
-from dhtorch.data.units import DepthUnit
-from dhtorch.export.arrays import encode_depth_codes
 from dhtorch.records import Camera, Frame
 
 RIGID = np.array([[0.0, 1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, -1, 1.5], [0, 0, 0, 1]])  # as nerfstudio's of COLMAP
 
 
 # ------------------------------------------------------------------------------------------------------ transforms.json
-
-
-@pytest.mark.parametrize("shared_K", [False, True])
-@pytest.mark.parametrize(("applied", "scale"), [(None, 1.0), (RIGID, 1.0), (RIGID, 0.25), (None, 3.0)])
-def test_what_is_written_is_read(applied: np.ndarray | None, scale: float, shared_K: bool, tmp_path: Path) -> None:
-    """Poses are those before the converter's transformation and scale, in metres."""
-    frames = walk(4)
-    write_nerfstudio(tmp_path, frames, applied=applied, scale=scale, shared_K=shared_K)
-    assert data.recognise(tmp_path) == ("nerfstudio", "transforms.json")
-    recording = data.open(tmp_path)
-    check_frames(recording, frames, 1e-3)
-    assert recording.times.tolist() == pytest.approx([float(f.time[0]) for f in frames], abs=1e-6)
-    assert recording.number.tolist() == [1, 2, 3, 4] and recording.pose_axes == "gl"
-    assert recording.depth_unit == DepthUnit(1e-3, "transforms.json: depth_unit_scale_factor")
-    remark = (f"poses are stored times {scale:g} (applied_scale): undone",)
-    assert recording.report == (() if scale == 1 else remark)
-    assert torch.equal(data.open(tmp_path / "transforms.json")[1].depth, recording[1].depth)
 
 
 def with_camera(n: int, f: list[float], c: list[float], lens: list[float] | None = None, **options: Any) -> Any:
@@ -61,6 +41,20 @@ def in_turn(*entries: dict[str, Any]) -> tuple[str, Any]:
     return FILE, {"frames": dict(enumerate(entries))}
 
 
+def float_map(i: int, kind: str) -> bytes:
+    """Depth of frame ``i`` in m, with one value that is none, as a file."""
+    values, file = walk(2)[i].depth[0].numpy().copy(), io.BytesIO()
+    values[0, 0] = np.nan
+    np.save(file, values[..., None]) if kind == "npy" else Image.fromarray(values).save(file, "tiff")
+    return file.getvalue()
+
+
+def levelled() -> list[Frame]:
+    """Frames with all three levels of confidence."""
+    levels = (torch.arange(48 * 64) % 3).to(torch.uint8).reshape(1, 48, 64)
+    return [f.replace(conf=levels) for f in walk(3)]
+
+
 FILE = "transforms.json"
 LENS = [0.01, -0.02, 0.003, -0.004, 0.005]
 ANGLE = {"camera_angle_x": 2 * np.arctan(0.5)}
@@ -70,7 +64,32 @@ STEM = [str(round((100 + i / 30) * 1e6)) for i in range(4)]
 KEY = "keyframes"
 MODEL = "sparse/0"
 
+FOUR = ([0, 1, 2, 3], 1e-3, 1.0, True)
 CASES = [
+    # Poses are those before the converter's transformation and scale, in metres.
+    *(Case(f"nerfstudio, {name} {scale} {shared}", nerf, 4, (),
+           {"format": "nerfstudio", "number": [1, 2, 3, 4], "axes": "gl", "same": FOUR,
+            "times of": [100.0, 100.033333, 100.066667, 100.1], "unit": (1e-3, f"{FILE}: depth_unit_scale_factor"),
+            "report": () if scale == 1 else (f"poses are stored times {scale:g} (applied_scale): undone",)},
+           written={"applied": applied, "scale": scale, "shared_K": shared}, path=path)
+      for shared, path in ((False, "."), (True, FILE))
+      for name, applied, scale in (("plain", None, 1.0), ("rigid", RIGID, 1.0), ("rigid", RIGID, 0.25), ("plain", None, 3.0))),
+    Case("codes of no return", nerf, 2, [("depth/frame_00001.png", np.full((48, 64), 65535, np.uint16))], {"returns": 0}),
+    Case("images of half the size", nerf, 2, [("images/*", np.zeros((24, 32, 3), np.uint8))],
+         {"f": pytest.approx([61.5 / 2, 58.25 / 2]),
+          "report": ("images of 32x24, transforms.json states K for 64x48: K is scaled",)}),
+    Case("images of another shape", nerf, 2, [("images/*", np.zeros((32, 32, 3), np.uint8))], error="image size"),
+    *(Case(f"floats in {kind} without unit are metres", nerf, 2,
+           [*((f"depth/frame_{i + 1:05d}.{kind}", float_map(i, kind)) for i in range(2)),
+            in_turn(*({"depth_file_path": f"depth/frame_{i + 1:05d}.{kind}"} for i in range(2)))],
+           {"unit": (1.0, None), "returns": 48 * 64 - 1,
+            "median": pytest.approx(float(torch.cat([f.depth.flatten()[1:] for f in walk(2)]).median()))},
+           written={"unit_key": None}) for kind in ("npy", "tiff")),
+    *(Case(f"images of two folders are two cameras, {name}", nerf, 4,
+           [*((f"images/frame_{i:05d}.png", Path(f"images/left/frame_{i:05d}.png")) for i in (1, 2)),
+            in_turn(*({"file_path": f"images/left/frame_{i:05d}.png"} for i in (1, 2)))],
+           {"title": f"capture/{name}", "number": numbers, "same": (places, 1e-3, 1.0, True)}, which=place)
+      for place, (name, numbers, places) in enumerate((("images/left", [1, 2], [0, 1]), ("images", [3, 4], [2, 3])))),
     *(Case(f"nerfcapture, {key}", nerf, 3, (),
            {"unit": (10 / 65535, f"{FILE}: {key}"), "times": None, "same": ([0, 1, 2], 10 / 65535)},
            written={"unit_key": key, "unit_m": 10 / 65535, "depth_key": "depth_path", "suffix": "", "times": False})
@@ -126,6 +145,12 @@ CASES = [
     *(Case(f"the whole file is {content!r}", nerf, 2, [(FILE, content)], error=r"transforms\.json")
       for content in ("", "[]", "{}", '{"frames": 3}', '{"frames": [3]}', '{"frames": []}')),
     # Polycam
+    *(Case(f"polycam, corrected {corrected}, {path}", polycam, levelled, (),
+           {"format": "polycam", "title": "capture", "report": (), "axes": "gl", "conf": True,
+            "unit": (1e-3, "format definition: Polycam stores millimetres"), "same": ([0, 1, 2], 1e-3, 1.0, True)},
+           written={"corrected": corrected}, path=path) for corrected in (True, False) for path in (".", "keyframes")),
+    Case("polycam, poses as captured", polycam, levelled, (),
+         {"start": pytest.approx((walk(1)[0].T_world_from_cam.t[0] + 1).tolist())}, options={"corrected": False}),
     Case("polycam, what is missing", polycam, 4,
          [(f"{KEY}/cameras/{STEM[1]}.json", DELETE), (f"{KEY}/depth/{STEM[2]}.png", DELETE),
           (f"{KEY}/confidence/{STEM[3]}.png", DELETE)],
@@ -167,80 +192,6 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
     check_case(case, tmp_path)
-
-
-def test_images_of_two_folders_are_two_cameras(tmp_path: Path) -> None:
-    frames = walk(4)
-    write_nerfstudio(tmp_path, frames)
-
-    left = [f"images/left/frame_{i:05d}.png" for i in (1, 2)]
-    edit_files(tmp_path, [(name.replace("left/", ""), Path(name)) for name in left])
-    edit_files(tmp_path, [in_turn(*({"file_path": name} for name in left))])
-    recordings = data.open_all(tmp_path)
-    assert [r.name.removeprefix(tmp_path.name) for r in recordings] == ["/images/left", "/images"]
-    assert [len(r) for r in recordings] == [2, 2]
-
-
-def test_images_of_another_size_than_stated(tmp_path: Path) -> None:
-    """Half-size images: K is scaled and that is reported; a cropped one is refused."""
-    frames = walk(2)
-    write_nerfstudio(tmp_path, frames)
-    for file in (tmp_path / "images").iterdir():
-        Image.open(file).resize((32, 24)).save(file)
-    recording = data.open(tmp_path)
-    assert torch.allclose(recording[0].camera.f, frames[0].camera.f / 2)
-    assert recording.report == ("images of 32x24, transforms.json states K for 64x48: K is scaled",)
-    for file in (tmp_path / "images").iterdir():
-        Image.open(file).resize((32, 32)).save(file)
-    with pytest.raises(FormatError, match="image size"):
-        data.open(tmp_path)
-
-
-@pytest.mark.parametrize("kind", ["npy", "tiff"])
-def test_floating_depth_without_unit_is_in_metres(kind: str, tmp_path: Path) -> None:
-    frames = walk(2)
-    write_nerfstudio(tmp_path, frames, unit_key=None)
-    for i, frame in enumerate(frames):
-        values = frame.depth[0].numpy().copy()
-        values[0, 0] = np.nan
-        file = tmp_path / "depth" / f"frame_{i + 1:05d}.{kind}"
-        np.save(file, values[..., None]) if kind == "npy" else Image.fromarray(values).save(file)
-    edit_files(tmp_path, [in_turn(*({"depth_file_path": f"depth/frame_{i + 1:05d}.{kind}"} for i in range(2)))])
-    recording = data.open(tmp_path)
-    assert recording.depth_unit == DepthUnit(1.0)
-    depth = recording[1].depth
-    assert float(depth[0, 0, 0]) == 0 and torch.allclose(depth[0, 1:], frames[1].depth[0, 1:])
-
-
-def test_codes_of_no_return_are_holes(tmp_path: Path) -> None:
-    frames = walk(2)
-    write_nerfstudio(tmp_path, frames)
-    file = tmp_path / "depth" / "frame_00001.png"
-    code = encode_depth_codes(frames[0].depth, 1000)
-    code[:5] = 65535
-    file.write_bytes(encode_unfiltered_png(code))
-    depth = data.open(tmp_path)[0].depth
-    assert not depth[0, :5].any() and depth[0, 5:].all()
-
-
-@pytest.mark.parametrize("corrected", [True, False])
-def test_polycam(corrected: bool, tmp_path: Path) -> None:
-    frames = walk(3)
-    write_polycam(tmp_path, frames, corrected=corrected)
-    assert data.recognise(tmp_path)[0] == data.recognise(tmp_path / "keyframes")[0] == "polycam"
-    recording = data.open(tmp_path)
-    check_frames(recording, frames, 1e-3)
-    assert recording.name == data.open(tmp_path / "keyframes").name == tmp_path.name
-    assert recording.report == ()
-    assert recording.depth_unit == DepthUnit(1e-3, "format definition: Polycam stores millimetres")
-    assert recording.pose_axes == "gl" and (recording[0].conf == 2).all()
-    levels = (torch.arange(frames[0].depth.numel()) % 3).to(torch.uint8).reshape(frames[0].depth.shape)
-    write_polycam(tmp_path, [f.replace(conf=levels) for f in frames], corrected=corrected)
-    assert torch.equal(data.open(tmp_path)[1].conf, levels)
-    if corrected:
-        captured = data.open(tmp_path, corrected=False)
-        offset = captured[0].T_world_from_cam.t - frames[0].T_world_from_cam.t
-        assert torch.allclose(offset, torch.ones(1, 3).double())
 
 
 def test_images_with_an_orientation_tag_are_turned_to_their_camera(tmp_path: Path) -> None:

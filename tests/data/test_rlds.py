@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
-import pickle
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from support.box_scene import HW
+from support.capture_cases import DELETE, Case, check_case
 from support.robot_episodes import three_episodes
 from support.writers import write_rlds
 
@@ -19,11 +19,10 @@ from dhtorch import data
 from dhtorch.cli import inspect
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.data.codecs import tfrecord
-from dhtorch.data.intrinsics import MissingIntrinsicsError
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import rlds
 from dhtorch.export.arrays import encode_depth_codes
 from dhtorch.pipeline.presets import METHODS
+from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 
 ROOT = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "rlds_bridge" / "bridge_dataset" / "1.0.0"
@@ -54,36 +53,6 @@ def test_what_is_written_is_read(depth: str | None, has_size: bool, tmp_path: Pa
         assert recording.times is not None and torch.equal(recording.times, torch.arange(len(frames)).double() / 30)
 
 
-def test_options(tmp_path: Path) -> None:
-    write_rlds(tmp_path, three_episodes(), depth="array", intrinsics=False, poses=False)
-    one = data.open(tmp_path, episode=2, K=[100, 100, 32, 24])
-    assert (
-        one.name == "tiny_robot/train_000002/image_0" and one.episode == 2 and one.poses is None and one.times is None
-    )
-    assert one[0].camera.f.tolist() == [[100, 100]]
-    wide = data.open(tmp_path, episode=0, split="train", fov=90.0)
-    assert float(wide[0].camera.f[0, 0]) == pytest.approx(HW[1] / 2)
-    mm = data.open(tmp_path, episode=0, fov=90.0, depth_unit="mm")
-    assert torch.allclose(mm[0].depth * 1000, wide[0].depth, atol=1e-4)
-    again = pickle.loads(pickle.dumps(one))
-    assert torch.equal(again[1].image, one[1].image)
-    with pytest.raises(MissingIntrinsicsError, match=r"data\.fov=69"):
-        data.open(tmp_path, episode=0)
-    for options, said in (
-        ({"episode": 3}, "found 3, expected 0 to 2 in train"),
-        ({"split": "test"}, "found test, expected one of train"),
-        ({"camera": "observation/image_9"}, "expected one of observation/image_0"),
-        ({"depth": "observation/depth_9"}, "option depth"),
-        ({"intrinsics": "K"}, "option intrinsics"),
-        ({"rate_hz": 0}, "option rate_hz"),
-        ({"fov": 90.0, "K": [1, 1, 1, 1]}, "found data.K and data.fov, expected one of them"),
-        ({"intrinsics": "action"}, "found 7 numbers a step, expected 4 or 9"),
-        ({"fov": 90.0, "pose": "is_last"}, "expected 7 or 16"),
-    ):
-        with pytest.raises(FormatError, match=said):
-            _ = data.open_all(tmp_path, **options)[0]
-
-
 def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
     write_rlds(tmp_path, three_episodes())
     file = tmp_path / FILE
@@ -95,6 +64,47 @@ def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
     assert len(found[0]) == 2 and len(found[2]) == 4
     with pytest.raises(FormatError, match=r"record at byte \d+: found checksum [0-9a-f]{8}, expected [0-9a-f]{8}"):
         found[1]
+
+
+def write_set(root: Path, _frames: list[Frame]) -> None:
+    """Three episodes without intrinsics and poses."""
+    write_rlds(root, three_episodes(), depth="array", intrinsics=False, poses=False)
+
+
+def rlds_case(name: str, edits: Any = (), expect: Any = None, **more: Any) -> Case:
+    return Case(name, write_set, lambda: three_episodes()[2], edits, expect or {}, **more)
+
+
+FEATURES, K = "features.json", {"K": [100, 100, 32, 24]}
+LONG: Any = {"featuresDict": {"features": {"image_0": {"image": {"shape": {"dimensions": ["1" * 40, "2", "3"]}}}}}}
+LONG = {"featuresDict": {"features": {"observation": LONG}}}
+LONG = {"featuresDict": {"features": {"steps": {"sequence": {"feature": LONG}}}}}
+CASES = [
+    rlds_case("one episode", (), {"title": "tiny_robot/train_000002/image_0", "posed": False, "times": None,
+                                  "f": [100, 100], "number": [0, 1, 2, 3]}, options={"episode": 2} | K),
+    rlds_case("a field of view", (), {"f": pytest.approx([HW[1] / 2] * 2)},
+              options={"episode": 0, "split": "train", "fov": 90.0}),
+    rlds_case("millimetres", (), {"unit": (1e-3, "option depth_unit")},
+              options={"episode": 0, "fov": 90.0, "depth_unit": "mm"}),
+    rlds_case("no K", options={"episode": 0}, error=r"data\.fov=69"),
+    *(rlds_case(f"option {options}", options=options, error=message) for options, message in (
+        ({"episode": 3}, "found 3, expected 0 to 2 in train"), ({"split": "test"}, "found test, expected one of train"),
+        ({"camera": "observation/image_9"}, "expected one of observation/image_0"),
+        ({"depth": "observation/depth_9"}, "option depth"), ({"intrinsics": "K"}, "option intrinsics"),
+        ({"rate_hz": 0}, "option rate_hz"),
+        ({"fov": 90.0, "K": [1, 1, 1, 1]}, "found data.K and data.fov, expected one of them"),
+        ({"intrinsics": "action"}, "found 7 numbers a step, expected 4 or 9"),
+        ({"fov": 90.0, "pose": "is_last"}, "expected 7 or 16"))),
+    *(rlds_case(f"features {content}", [(FEATURES, content)], options=K, error=r"features\.json")
+      for content in ("{}", '{"featuresDict": {"features": {}}}', "[]")),
+    rlds_case("sizes of no array", [(FEATURES, LONG)], options=K, error="sizes of an array"),
+    rlds_case("no features", [(FEATURES, DELETE)], error="format: found"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
 
 
 # ---------------------------------------------------------------------------------------------------- checksums, messages
@@ -161,20 +171,6 @@ def test_whole_numbers_of_all_sizes(tmp_path: Path) -> None:
         tfrecord.read_feature_numbers(file, "x", feature, 3)
 
 
-def test_a_set_that_says_nothing(tmp_path: Path) -> None:
-    write_rlds(tmp_path, three_episodes()[:1])
-    said = json.loads((tmp_path / "features.json").read_text())
-    for content in ({}, {"featuresDict": {"features": {}}}, []):
-        (tmp_path / "features.json").write_text(json.dumps(content))
-        with pytest.raises(FormatError, match=r"features\.json"):
-            data.open_all(tmp_path, fov=60.0)
-    steps = said["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
-    steps["observation"]["featuresDict"]["features"]["image_0"]["image"]["shape"] = {"dimensions": ["1" * 40, "2", "3"]}
-    (tmp_path / "features.json").write_text(json.dumps(said))
-    with pytest.raises(FormatError, match="sizes of an array"):
-        data.open_all(tmp_path, fov=60.0)
-
-
 # ---------------------------------------------------------------------------------------------------- still cameras
 
 
@@ -221,10 +217,3 @@ def test_the_bridge_set_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureF
     assert inspect.main([str(ROOT), "--max-frames", "2", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "rlds" in said and "no intrinsics" in said and "64x64" in said
-
-
-def test_sets_are_recognised_by_both_files(tmp_path: Path) -> None:
-    write_rlds(tmp_path, three_episodes()[:1])
-    assert rlds.recognise(tmp_path) is not None
-    (tmp_path / "features.json").unlink()
-    assert rlds.recognise(tmp_path) is None

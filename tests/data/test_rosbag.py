@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import bz2
-import pickle
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import lz4.frame
 import numpy as np
 import pytest
 import torch
-from support.box_scene import disagreement, off_wall, own_camera, render, walk, world_points
+from support.box_scene import render, walk
+from support.capture_cases import Case, check_case, check_frames
 from support.writers.rosbag import BagLayout, BagWriter, write_rosbag
 
 from dhtorch import data
 from dhtorch.data.codecs import bags, ros_images
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.data.readers.rosbag_index import crop_camera
-from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
@@ -28,19 +28,6 @@ from dhtorch.records import Camera, Frame, Pose
 STEP = 1e-3  # m, of a code of 16UC1
 CAMERA_FRAME = BagLayout().colour_frame
 SDK_DEPTH, SDK_COLOUR = "/device_0/sensor_0/Depth_0/image/data", "/device_0/sensor_1/Color_0/image/data"
-
-
-def same_frames(recording: data.Recording, frames: list[Frame], *, image: float = 0, depth: float = STEP / 2) -> None:
-    assert len(recording) == len(frames)
-    for got, want in zip(recording, frames, strict=True):
-        torch.testing.assert_close(got.camera.f, want.camera.f)
-        torch.testing.assert_close(got.camera.c, want.camera.c)
-        torch.testing.assert_close(got.depth, want.depth, atol=depth + 1e-6, rtol=0)
-        torch.testing.assert_close(got.time, want.time, atol=1e-6, rtol=0)
-        assert float((got.image.float() - want.image.float()).abs().mean()) <= image
-        if recording.poses is not None:
-            torch.testing.assert_close(got.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-9, rtol=0)
-            torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-9, rtol=0)
 
 
 STORAGES = {
@@ -52,44 +39,19 @@ STORAGES = {
 }
 PACKED = "/camera/color/image_raw/compressed"
 PACKED_DEPTH = "/camera/aligned_depth_to_color/image_raw/compressedDepth"
-#: Name of the bag, its layout, largest mean error of the images and largest one of depth.
+#: Name of the bag, its layout, step of depth, and whether images are lossless.
 BAGS = [
-    *((name, layout, 0, STEP / 2) for name, layout in STORAGES.items()),
-    ("a", BagLayout(colour_encoding="bgr8", depth_encoding="32FC1"), 0, 1e-6),
-    ("a", BagLayout(colour_encoding="rgba8"), 0, STEP / 2),
-    ("a", BagLayout(colour_encoding="bgra8"), 0, STEP / 2),
-    ("a", BagLayout(colour_encoding="png", colour_topic=PACKED, depth_encoding="16UC1 png", depth_topic=PACKED_DEPTH), 0, STEP / 2),
-    ("a", BagLayout(colour_encoding="jpeg", colour_topic=PACKED, depth_encoding="32FC1 png", depth_topic=PACKED_DEPTH), 3, 2e-3),
-    *(
-        (name, BagLayout(storage, depth_encoding=depth, padding=12, big_endian=big), 0, STEP / 2)
-        for depth in ("16UC1", "32FC1")
-        for big in (False, True)
-        for name, storage in (("a", "mcap"), ("a.bag", "ros1"))
-    ),
+    *((name, layout, STEP, True) for name, layout in STORAGES.items()),
+    ("a", BagLayout(colour_encoding="bgr8", depth_encoding="32FC1"), 0, True),
+    ("a", BagLayout(colour_encoding="rgba8"), STEP, True),
+    ("a", BagLayout(colour_encoding="bgra8"), STEP, True),
+    ("a", BagLayout(colour_encoding="png", colour_topic=PACKED, depth_encoding="16UC1 png", depth_topic=PACKED_DEPTH),
+     STEP, True),
+    ("a", BagLayout(colour_encoding="jpeg", colour_topic=PACKED, depth_encoding="32FC1 png", depth_topic=PACKED_DEPTH),
+     4e-3, False),
+    *((name, BagLayout(storage, depth_encoding=depth, padding=12, big_endian=big), STEP, True)
+      for depth in ("16UC1", "32FC1") for big in (False, True) for name, storage in (("a", "mcap"), ("a.bag", "ros1"))),
 ]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "layout", "image", "depth"), BAGS)
-def test_bags_are_read_back(tmp_path: Path, name: str, layout: BagLayout, image: float, depth: float) -> None:
-    frames = walk(3)
-    write_rosbag(tmp_path / name, frames, layout)
-    (recording,) = data.open_all(tmp_path / name)
-    assert recording.format == "rosbag" and recording.poses is not None and recording.report == ()
-    is_metric = layout.depth_encoding.startswith("32FC1")
-    assert recording.depth_unit == (None if is_metric else DepthUnit(STEP, "REP 118: 16UC1"))
-    for part in [] if name.endswith(".bag") else tmp_path.glob(f"{name}/*.[md][cb]*"):
-        same_frames(data.open(part), frames, image=image, depth=depth)  # a file of the folder alone
-    same_frames(pickle.loads(pickle.dumps(recording)), frames, image=image, depth=depth)
-    if depth == STEP / 2:
-        assert float(off_wall(world_points(own_camera(recording[1]))).max()) < 2 * STEP
-        assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
-
-
-def test_messages_have_the_times_at_which_they_were_recorded(tmp_path: Path) -> None:
-    frames = walk(2)
-    write_rosbag(tmp_path / "a.bag", frames, BagLayout("ros1"))
-    times = {message.time_ns for message in bags.iter_messages(tmp_path / "a.bag")}
-    assert {round(1e9 * float(frame.time)) for frame in frames} <= times
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
@@ -110,54 +72,7 @@ def test_chunks_of_mcap_are_decompressed(tmp_path: Path, compression: str) -> No
                 channels[channel.id] = out.register_channel(channel.topic, channel.message_encoding, number)
             out.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         out.finish()
-    same_frames(data.open(tmp_path / "a.mcap"), frames)
-
-
-def test_grey_images_and_holes(tmp_path: Path) -> None:
-    (frame,) = walk(1)
-    frame.depth[0, 0, :4] = torch.tensor([float("nan"), float("inf"), -1.0, 0.0])
-    write_rosbag(tmp_path / "bag", [frame], BagLayout(colour_encoding="mono8", depth_encoding="32FC1"))
-    got = data.open(tmp_path / "bag")[0]
-    assert torch.equal(got.image[0, 0], frame.image[0, 1])
-    assert got.depth[0, 0, :4].tolist() == [0, 0, 0, 0] and bool((got.depth[0, 1:] > 0).all())
-
-
-def test_a_raw_topic_is_preferred_and_topics_can_be_set(tmp_path: Path) -> None:
-    frames = walk(2)
-    other = [frame.replace(image=255 - frame.image) for frame in frames]
-    write_rosbag(tmp_path / "a.bag", frames, BagLayout(storage="ros1"))
-    assert data.open(tmp_path / "a.bag").camera_name == "/camera/color/image_raw"
-
-    spare = {"depth_topic": "/spare/depth/image", "infos": False, "poses": False}
-    layout = BagLayout(colour_topic=PACKED, colour_encoding="png", **spare)
-    write_rosbag(tmp_path / "b", frames, begin=lambda bag: [bag.write_frame(frame, layout) for frame in other])
-    same_frames(data.open(tmp_path / "b"), frames)
-    assert torch.equal(data.open(tmp_path / "b", color=PACKED)[0].image, other[0].image)
-    for options, message in (
-        ({"color": "/nothing"}, r"option color: found /nothing, expected one of /camera"),
-        ({"depth": "/camera/color/image_raw"}, r"option depth: found /camera/color/image_raw of encoding rgb8"),
-    ):
-        with pytest.raises(FormatError, match=message):
-            data.open(tmp_path / "b", **options)
-
-
-def test_each_camera_is_a_recording(tmp_path: Path) -> None:
-    left, right = walk(2), [frame.replace(image=255 - frame.image, depth=frame.depth + 1) for frame in walk(2)]
-    layouts = [
-        BagLayout(
-            colour_topic=f"/{side}/color/image_raw", depth_topic=f"/{side}/aligned_depth_to_color/image_raw",
-            colour_frame=f"{side}_optical", depth_frame=f"{side}_optical", poses=False,
-        )
-        for side in ("left", "right")
-    ]  # fmt: skip
-
-    write_rosbag(tmp_path / "bag", left, layouts[0], begin=lambda bag: [bag.write_frame(f, layouts[1]) for f in right])
-    recordings = data.open_all(tmp_path / "bag")
-    by_camera = {recording.camera_name: recording for recording in recordings}
-    assert by_camera.keys() == {"/left/color/image_raw", "/right/color/image_raw"}
-    assert len({recording.name for recording in recordings}) == 2
-    same_frames(by_camera["/left/color/image_raw"], left)
-    same_frames(by_camera["/right/color/image_raw"], right)
+    check_frames(data.open(tmp_path / "a.mcap"), frames, STEP, exact=True)
 
 
 # ------------------------------------------------------------------------------------------------- two cameras, poses
@@ -186,6 +101,7 @@ def matrix(T: Pose) -> np.ndarray:
 
 
 def assert_registered(recording: data.Recording) -> None:
+    assert recording.report == ()
     for got, want in zip(recording, walk(len(recording)), strict=True):
         assert got.depth_camera is None
         camera = cameras.resize(got.camera, got.hw, tuple(got.depth.shape[1:]))
@@ -196,19 +112,103 @@ def assert_registered(recording: data.Recording) -> None:
         assert float(error.median()) < 0.01  # of a pixel's shift; 5 cm and 2 degrees unregistered make 5 %
 
 
+def spare(frames: list[Frame], layout: BagLayout) -> Any:
+    """What writes messages of other cameras at the beginning of a bag."""
+    return lambda bag: [bag.write_frame(frame, layout) for frame in frames]
+
+
+def inverted(n: int = 2, deeper: float = 0) -> list[Frame]:
+    return [frame.replace(image=255 - frame.image, depth=frame.depth + deeper) for frame in walk(n)]
+
+
+def side(name: str) -> BagLayout:
+    """The topics of one of two cameras."""
+    topics = {kind: f"/{name}/{topic}/image_raw" for kind, topic in
+              (("colour_topic", "color"), ("depth_topic", "aligned_depth_to_color"))}  # fmt: skip
+    return BagLayout(**topics, colour_frame=f"{name}_optical", depth_frame=f"{name}_optical", poses=False)
+
+
+def holed() -> list[Frame]:
+    """A grey frame with values that are no depth."""
+    (frame,) = walk(1)
+    frame.depth[0, 0, :4] = torch.tensor([float("nan"), float("inf"), -1.0, 0.0])
+    return [frame.replace(image=frame.image[:, 1:2].expand(-1, 3, -1, -1))]
+
+
+def moving_tree(bag: BagWriter) -> None:
+    """Poses of the camera in a frame that may move."""
+    for f in walk(2):
+        bag.write_transform("/tf", float(f.time), "base_link", CAMERA_FRAME, matrix(f.T_world_from_cam))
+
+
+def bag_case(name: str, frames: Any, layout: BagLayout, expect: Any = None, *, file: str = "a", begin: Any = None,
+             written: Any = None, path: str | None = None, **more: Any) -> Case:  # fmt: skip
+    """A bag with the frames (``written`` where others than the expected ones) in a layout."""
+
+    def write(root: Path, shots: list[Frame]) -> None:
+        write_rosbag(root / file, shots if written is None else written, layout, begin=begin)
+
+    return Case(name, write, frames, (), expect or {}, path=file if path is None else path, **more)
+
+
+def unit_of(layout: BagLayout) -> tuple[float, str] | None:
+    return None if layout.depth_encoding.startswith("32FC1") else (STEP, "REP 118: 16UC1")
+
+
+PACKED_LAYOUT = BagLayout(colour_topic=PACKED, colour_encoding="png", depth_topic="/spare/depth/image", infos=False,
+                          poses=False)  # fmt: skip
+TIMES = [100.0, 100.033333, 100.066667]
+CASES = [
+    *(bag_case(f"{name} {k}", 3, layout, {"format": "rosbag", "report": (), "posed": True, "unit": unit_of(layout),
+                                          "times of": TIMES, "same": ([0, 1, 2], step, 1.0, exact)}, file=name)
+      for k, (name, layout, step, exact) in enumerate(BAGS)),
+    *(bag_case(f"a file of the folder alone, {name}", 3, STORAGES[name], {"same": ([0, 1, 2], STEP, 1.0, True)},
+               file=name, path=f"{name}/{name}{part}")
+      for name, part in (("mcap", ".mcap"), ("sqlite3", ".db3"))),
+    bag_case("grey images and holes", holed, BagLayout(colour_encoding="mono8", depth_encoding="32FC1"),
+             {"returns": 48 * 64 - 4}),
+    bag_case("a raw topic is preferred", 2, BagLayout("ros1"), {"camera": "/camera/color/image_raw"}, file="a.bag"),
+    bag_case("of two colour topics the raw one", 2, BagLayout(), {"same": ([0, 1], STEP, 1.0, True)},
+             begin=spare(inverted(), PACKED_LAYOUT)),
+    bag_case("a topic by option", 2, BagLayout(), {"same": ([0, 1], STEP)}, options={"color": PACKED},
+             written=inverted(), begin=spare(walk(2), PACKED_LAYOUT)),
+    *(bag_case(f"option {options}", 2, BagLayout(), options=options, error=message) for options, message in (
+        ({"color": "/nothing"}, r"option color: found /nothing, expected one of /camera"),
+        ({"depth": "/camera/color/image_raw"}, r"option depth: found /camera/color/image_raw of encoding rgb8"))),
+    *(bag_case(f"each camera is a recording, {name}", frames, side("left"),
+               {"camera": f"/{name}/color/image_raw", "f": walk(1)[0].camera.f[0].tolist(),
+                "median": pytest.approx(float(torch.cat([f.depth for f in frames()]).median()), abs=STEP)},
+               written=walk(2), begin=spare(inverted(deeper=1), side("right")), which=place)
+      for place, (name, frames) in enumerate((("right", lambda: inverted(deeper=1)), ("left", lambda: walk(2))))),
+    bag_case("without a transform depth keeps its camera", two_cameras, BagLayout(**APART),
+             {"depth f": OWN.f[0].tolist(), "report": ["the depth is not registered to colour"]}),
+    bag_case("images without depth", 5, BagLayout(), {"number": [0, 1, 3, 4], "report": ["^frame 2: no depth of"],
+                                                      "same": ([0, 1, 3, 4], STEP, 1.0, True)},
+             written=[], begin=lambda bag: [bag.write_frame(frame, BagLayout(depth_lag_s=0.6 if i == 2 else 0.0))
+                                            for i, frame in enumerate(walk(5))]),
+    bag_case("poses in a frame that may move", 2, BagLayout(poses=False), {
+        "report": ("poses are relative to the frame base_link: valid only while that is stationary",),
+        "same": ([0, 1], STEP, 1.0, True)}, begin=moving_tree),
+    bag_case("no calibration, K by option", 2, BagLayout(infos=False), {"same": ([0, 1], STEP, 1.0, True)},
+             options={"K": [61.5, 58.25, 33.5, 21.75]}),
+    bag_case("no depth topic", 2, BagLayout(depth_topic="/a/ir/image"),
+             error=r"depth topic: found .*/a/ir/image \(16UC1\)"),
+    bag_case("no calibration", 2, BagLayout(infos=False),
+             error=r"no intrinsics, expected .*data.K=.* CameraInfo of /camera/color/image_raw"),
+    bag_case("no images", 1, BagLayout("ros1"), written=[], file="a.bag",
+             begin=lambda bag: [bag.write("/joy", "std_msgs/msg/Float32", 100.0, {"data": 1.0}) for _ in range(2)],
+             error=r"colour topic: found /joy \(std_msgs/Float32\), expected"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
+    check_case(case, tmp_path)
+
+
 def test_depth_of_another_camera_is_registered_by_the_fixed_transform(tmp_path: Path) -> None:
-    layout = BagLayout(**APART, T_colour_from_depth=matrix(T_COLOUR_FROM_DEPTH))
-    write_rosbag(tmp_path / "bag", two_cameras(), layout)
-    recording = data.open(tmp_path / "bag")
-    assert recording.report == ()
-    assert_registered(recording)
-
-
-def test_without_a_transform_depth_keeps_its_camera_and_it_is_reported(tmp_path: Path) -> None:
-    write_rosbag(tmp_path / "bag", two_cameras(), BagLayout(**APART))
-    recording = data.open(tmp_path / "bag")
-    torch.testing.assert_close(recording[0].depth_camera.f, OWN.f)
-    assert any("the depth is not registered to colour" in line for line in recording.report)
+    write_rosbag(tmp_path / "bag", two_cameras(), BagLayout(**APART, T_colour_from_depth=matrix(T_COLOUR_FROM_DEPTH)))
+    assert_registered(data.open(tmp_path / "bag"))
 
 
 def test_the_sdk_of_realsense_states_unit_and_extrinsics(tmp_path: Path) -> None:
@@ -234,17 +234,6 @@ def test_the_sdk_of_realsense_states_unit_and_extrinsics(tmp_path: Path) -> None
     torch.testing.assert_close(twice[0].depth, 2 * recording[0].depth)
 
 
-def test_unpaired_pictures_are_left_out_and_named(tmp_path: Path) -> None:
-    frames = walk(5)
-
-    layouts = [BagLayout(depth_lag_s=0.6 if i == 2 else 0.0) for i in range(5)]
-    write_rosbag(tmp_path / "bag", [], begin=lambda bag: [*map(bag.write_frame, frames, layouts)])
-    recording = data.open(tmp_path / "bag")
-    assert recording.number.tolist() == [0, 1, 3, 4]
-    assert any(line.startswith("frame 2: no depth of") for line in recording.report)
-    same_frames(recording, [frames[i] for i in (0, 1, 3, 4)])
-
-
 def test_poses_along_a_chain_are_interpolated(tmp_path: Path) -> None:
     frames = walk(3)
     mount = se3.exp(torch.tensor([[0.1, 0.2, -0.3, 1.2, -1.2, 1.2]]).double())
@@ -266,21 +255,7 @@ def test_poses_along_a_chain_are_interpolated(tmp_path: Path) -> None:
     assert data.open(tmp_path / "bag", poses=False).poses is None
 
 
-def test_poses_in_a_frame_that_may_move_are_named(tmp_path: Path) -> None:
-    stated = [("/tf", float(f.time), "base_link", CAMERA_FRAME, matrix(f.T_world_from_cam)) for f in walk(2)]
-    layout = BagLayout(poses=False)
-    write_rosbag(tmp_path / "bag", walk(2), layout, begin=lambda bag: [bag.write_transform(*each) for each in stated])
-    recording = data.open(tmp_path / "bag")
-    assert recording.report == ("poses are relative to the frame base_link: valid only while that is stationary",)
-    same_frames(recording, walk(2))
-
-
 # ------------------------------------------------------------------------------------------------------- intrinsics
-
-
-def test_without_calibration_K_is_an_option(tmp_path: Path) -> None:
-    write_rosbag(tmp_path / "bag", walk(2), BagLayout(infos=False))
-    same_frames(data.open(tmp_path / "bag", K=[61.5, 58.25, 33.5, 21.75]), walk(2))
 
 
 def info(model: str, d: Sequence[float], focal: Sequence[float] = (600.0, 600.0), **more: int) -> SimpleNamespace:
@@ -364,27 +339,6 @@ def test_bayer_and_yuv_pictures() -> None:
 # ---------------------------------------------------------------------------------------------- damaged, odd, hostile
 
 
-@pytest.mark.parametrize(
-    ("layout", "n", "begin", "message"),
-    [
-        (BagLayout(depth_topic="/a/ir/image"), 2, None, r"depth topic: found .*/a/ir/image \(16UC1\)"),
-        (BagLayout(infos=False), 2, None, r"no intrinsics, expected .*data.K=.* CameraInfo of /camera/color/image_raw"),
-        (
-            BagLayout("ros1"),
-            0,
-            lambda bag: [bag.write("/joy", "std_msgs/msg/Float32", 100.0, {"data": 1.0}) for _ in range(2)],
-            r"colour topic: found /joy \(std_msgs/Float32\), expected",
-        ),
-    ],
-)
-def test_what_a_bag_lacks_is_named(
-    tmp_path: Path, layout: BagLayout, n: int, begin: Callable[[BagWriter], object] | None, message: str
-) -> None:
-    write_rosbag(tmp_path / "a.bag", walk(n or 1)[:n], layout, begin=begin)
-    with pytest.raises(FormatError, match=message):
-        data.open(tmp_path / "a.bag")
-
-
 @pytest.mark.parametrize("name", STORAGES)
 def test_a_truncated_bag_gives_its_whole_messages_or_one_line(tmp_path: Path, name: str) -> None:
     write_rosbag(tmp_path / name, walk(4), STORAGES[name])
@@ -411,13 +365,6 @@ def test_a_view_in_a_database_is_not_executed(tmp_path: Path) -> None:
         database.execute("CREATE VIEW messages AS SELECT * FROM stored")
     with pytest.raises(FormatError, match="messages: found view, expected a plain table"):
         data.open(file)
-
-
-def test_nothing_is_written_beside_a_database(tmp_path: Path) -> None:
-    write_rosbag(tmp_path / "bag", walk(2), BagLayout(storage="sqlite3"))
-    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "bag").iterdir()}
-    _ = data.open(tmp_path / "bag")[0]
-    assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "bag").iterdir()} == before
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import pickle
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +13,13 @@ import numpy as np
 import pytest
 import torch
 from support import writers
-from support.box_scene import disagreement, off_wall, own_camera, pose, turned_over, world_points
-from support.capture_cases import DELETE, Case, check_case, check_frames
-from support.stray_frames import HW, camera_of, walk
+from support.box_scene import disagreement, turned_over
+from support.capture_cases import DELETE, Case, check_case
+from support.stray_frames import DEPTH_HW, HW, camera_of, walk
 from support.writers import parts
 
-from dhtorch import data, pytree
+from dhtorch import data
 from dhtorch.data.clocks import FilmPairing
-from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import stray
 from dhtorch.export.stray import ARKIT_UP, turn_world
@@ -42,48 +40,6 @@ def picture_error(a: Frame, b: Frame) -> float:
 def steady(i: int) -> Pose:
     """Pose ``i`` of a motion so fast that the picture before or after is clearly another."""
     return se3.exp(torch.tensor([[0.0, 0.12 * i, 0.05 * i, 0.05 * i, 0.0, 0.0]]).double())
-
-
-@pytest.mark.parametrize("codec", ["libx264", "libx265"])
-@pytest.mark.parametrize("depth_format", ["png", "npy"])
-def test_capture_gives_back_the_scene(tmp_path: Path, codec: str, depth_format: Any) -> None:
-    frames = walk()
-    writers.write_stray(tmp_path, frames, codec=codec, per_frame=True, depth_format=depth_format)
-    assert data.recognise(tmp_path) == ("stray", "odometry.csv, camera_matrix.csv and depth/")
-    recording = data.open(tmp_path)
-    assert recording.report == () and recording.number.tolist() == [0, 1, 2, 3]
-    assert recording.rate_hz == pytest.approx(60, rel=1e-4)
-    check_frames(recording, frames, STEP, up=ARKIT_UP)
-    assert recording.times.tolist() == pytest.approx([float(f.time[0]) for f in frames], abs=1e-8)
-    assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
-    copy = pickle.loads(pickle.dumps(recording))
-    assert all(torch.equal(a.image, b.image) for a, b in zip(copy, recording, strict=True))
-    assert pytree.collate(list(recording)).image.shape == (4, 3, *HW)
-
-
-def test_random_access_and_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = walk(30, lambda i: pose(i / 8))
-    writers.write_stray(tmp_path, frames, per_frame=True)
-    recording = data.open(tmp_path)
-    for i in (29, 0, 13, 12, 13, 25, 3):
-        errors = [picture_error(recording[i], frame) for frame in frames]
-        assert errors[i] == min(errors) < 12
-        assert torch.equal(recording[i].camera.f, frames[i].camera.f)
-    monkeypatch.setattr(codec_video._Decoder, "frame", lambda *_: pytest.fail("decoded a picture"))
-    codec_video.close_videos()
-    assert len(data.open(tmp_path)) == 30
-
-
-def test_first_picture_before_time_zero(tmp_path: Path) -> None:
-    """An edit list hides it: a decoder that obeys shows n − 1 pictures, all one row too early."""
-    frames = walk(8, steady)
-    writers.write_stray(tmp_path, frames, per_frame=True, first_picture="hidden")
-    assert len(codec_video.read_video_times(tmp_path / "rgb.mp4")) == 7
-    recording = data.open(tmp_path)
-    assert recording.report == () and len(recording) == 8
-    right = [picture_error(a, b) for a, b in zip(recording, frames, strict=True)]
-    wrong = [picture_error(a, b) for a, b in zip(list(recording)[1:], frames, strict=False)]
-    assert max(right) < 12 < min(wrong)  # so the check can tell
 
 
 @pytest.fixture
@@ -243,6 +199,19 @@ def stray_case(name: str, frames: Any, edits: Any = (), expect: Any = None, **mo
 
 ALL = {"same": ([0, 1, 2, 3], STEP), "report": ()}
 CASES = [
+    *(stray_case(f"{codec}, {kind}", walk, (), ALL | {"number": [0, 1, 2, 3], "rate": pytest.approx(60, rel=1e-4)},
+                 written=EACH | {"codec": codec, "depth_format": kind})
+      for codec in ("libx264", "libx265") for kind in ("png", "npy")),
+    # An edit list hides the first image: a decoder that obeys shows n − 1 images, all one row too early.
+    stray_case("the first image before time 0", lambda: walk(8, steady), (),
+               {"number": list(range(8)), "report": (), "same": (list(range(8)), STEP)},
+               written=EACH | {"first_picture": "hidden"}),
+    stray_case("no film", walk, written=EACH | {"video": False},
+               error="rgb.mp4: file: found no such file, expected .*data.images=false reads depth only"),
+    stray_case("depth alone", walk, (),
+               {"hw": (0, 0), "all f": [80, 81, 82, 83], "posed": True, "depth hw": DEPTH_HW,
+                "depth f": cameras.resize(camera_of(0), HW, DEPTH_HW).f[0].tolist()},
+               written=EACH | {"video": False}, options={"images": False, "K_hw": HW}),
     stray_case("starts anywhere", walk, (), ALL | {"number": [998, 999, 1000, 1001]}, written=EACH | {"start": 998}),
     stray_case("frames dropped by the app", lagging, [IMU], ALL | {"rate": pytest.approx(15, rel=1e-4)}, written=EACH),
     stray_case("K of the last frame", walk, (), {"all f": [83] * 4, "report": ()}),
@@ -305,20 +274,6 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
     check_case(case, tmp_path)
-
-
-def test_no_video(tmp_path: Path) -> None:
-    frames = walk()
-    writers.write_stray(tmp_path, frames, per_frame=True, video=False)
-    expected = "rgb.mp4: file: found no such file, expected .*data.images=false reads depth only"
-    with pytest.raises(FormatError, match=expected):
-        data.open(tmp_path)
-    recording = data.open(tmp_path, images=False, K_hw=HW)
-    for got, want in zip(recording, frames, strict=True):
-        assert got.image.shape == (1, 3, 0, 0)
-        assert torch.equal(got.camera.f, want.camera.f)
-        assert float(off_wall(world_points(got)).max()) < 2 * STEP  # by the depth map's own camera
-    assert disagreement(recording[0], recording[1])[0] < 0.04
 
 
 @pytest.mark.data

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from support import writers
-from support.box_scene import CAMERA, HW, check_same, pose, walk
+from support.box_scene import CAMERA, HW, pose, walk
 from support.capture_cases import DELETE, Case, check_case
 from support.writers import parts
 
@@ -19,47 +20,11 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame
 
 
-def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
-    lens = torch.tensor([tum._CAMERA_CALIBRATIONS[1][1]])
-    frames = walk(3, CAMERA.replace(distortion=lens))
-    writers.write_tum(tmp_path, frames)
-    recording = data.open(tmp_path)
-    assert recording.format == "tum" and recording.report == ()
-    assert torch.equal(recording[0].camera.distortion, lens)
-    torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=1e-6, rtol=0)
-    check_same(recording, frames, 1 / 5000)
-
-
-def test_the_largest_code_is_no_depth(tmp_path: Path) -> None:
-    writers.write_tum(tmp_path, walk(1))
-    codes = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
-    next((tmp_path / "depth").iterdir()).write_bytes(parts.encode_unfiltered_png(codes))
-    depth = data.open(tmp_path)[0].depth[0]
-    assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 0])
-    assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
-
-
 def blank(n: int) -> list[Frame]:
     """Frames of the size that the published TUM calibration belongs to, with nothing to see."""
     image, depth = torch.zeros(1, 3, 480, 640, dtype=torch.uint8), torch.ones(1, 480, 640)
     stamps = [torch.tensor([100 + i / 30], dtype=torch.float64) for i in range(n)]
     return [Frame(image, depth, CAMERA, time=t, T_world_from_cam=pose(i)) for i, t in enumerate(stamps)]
-
-
-@pytest.mark.parametrize(
-    ("number", "fx", "k1"), [(1, 517.306408, 0.262383), (2, 520.908620, 0.231222), (3, 535.4, None)]
-)
-def test_tum_takes_the_calibration_of_its_camera(tmp_path: Path, number: int, fx: float, k1: float | None) -> None:
-    writers.write_tum(tmp_path, blank(1), camera=number)
-    camera = data.open(tmp_path)[0].camera
-    assert float(camera.f[0, 0]) == pytest.approx(fx)
-    assert camera.distortion is None if k1 is None else float(camera.distortion[0, 0]) == pytest.approx(k1)
-    ros = data.open(tmp_path, intrinsics="ros")[0].camera
-    assert ros.distortion is None and ros.f.tolist() == [[525, 525]] and ros.c.tolist() == [[319.5, 239.5]]
-    (tmp_path / "groundtruth.txt").unlink()
-    named = tmp_path.rename(tmp_path.parent / f"rgbd_dataset_freiburg{number}_xyz")
-    assert torch.equal(data.open(named)[0].camera.f, camera.f)
-    assert torch.equal(data.open(named, camera=1)[0].camera.f, torch.tensor([[517.306408, 516.469215]]))
 
 
 def test_association_is_one_to_one_and_closest_first() -> None:
@@ -107,10 +72,41 @@ def write_twin(root: Path, frames: list[Frame], **options: int) -> None:
     writers.write_tum(root / "rgbd_dataset_freiburg3_walking_xyz_validation", frames, **options)
 
 
+def write_named(number: int) -> Any:
+    """What writes into a folder that is named after its camera."""
+    return lambda root, frames, **options: writers.write_tum(root / TITLE.format(number), frames, **options)
+
+
 TUM = {"write": writers.write_tum, "frames": lambda: blank(3), "written": {"camera": 1}}
 POSES, NO_POSES = "groundtruth.txt", ("groundtruth.txt", DELETE)
 
+CODES = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
+LENS = torch.tensor([tum._CAMERA_CALIBRATIONS[1][1]])
+PUBLISHED = {
+    1: ([517.306408, 516.469215], 0.262383),
+    2: ([520.908620, 521.007327], 0.231222),
+    3: ([535.4, 539.2], None),
+}
+TITLE = "rgbd_dataset_freiburg{}_xyz"
 CASES = [
+    Case("as it is written", writers.write_tum, lambda: walk(3, CAMERA.replace(distortion=LENS)), (),
+         {"format": "tum", "report": (), "lens": LENS[0].tolist(), "times of": [100.0, 100.033333, 100.066667],
+          "same": ([0, 1, 2], 1 / 5000, 1.0, True)}),
+    *(Case(f"the largest code is no depth, {units}", writers.write_tum, 1, [("depth/*", CODES)],
+           {"returns": HW[0] * HW[1] // 2, "median": pytest.approx(1 / units)}, options={"units_per_metre": units})
+      for units in (5000, 5208)),
+    *(Case(f"camera {number} by {name}", write, lambda: blank(1), edits, expect, written={"camera": number}, path=path,
+           options=options)
+      for number, (f, k1) in PUBLISHED.items()
+      for name, write, edits, path, options, expect in (
+          ("trajectory", writers.write_tum, [], ".", {},
+           {"f": pytest.approx(f), "first term": k1 and pytest.approx(k1)}),
+          ("trajectory, registered", writers.write_tum, [], ".", {"intrinsics": "ros"},
+           {"f": [525, 525], "c": [319.5, 239.5], "lens": None}),
+          ("folder", write_named(number), [("*/groundtruth.txt", DELETE)], TITLE.format(number), {},
+           {"f": pytest.approx(f)}),
+          ("option", write_named(number), [("*/groundtruth.txt", DELETE)], TITLE.format(number), {"camera": 1},
+           {"f": pytest.approx(PUBLISHED[1][0])}))),
     Case("a validation twin has no poses", write_twin, lambda: blank(2),
          [("*/groundtruth.txt", DELETE),
           ("rgbd_dataset_freiburg3_walking_xyz_validation/accelerometer.txt", "# t ax ay az\n100.0 0.1 9.8\nno number\n")],

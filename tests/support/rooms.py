@@ -10,7 +10,7 @@ from dhtorch.geometry import se3
 from dhtorch.pytree import collate
 from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.synthetic.recording import SyntheticRoom, room_to_scene
-from support.writers.layouts import write_tum
+from support.writers.image_folders import write_tum
 
 
 @cache

@@ -26,7 +26,6 @@ from torch import Tensor
 from dhtorch.data import convert
 from dhtorch.data.clocks import interpolate_poses, nearest_stamps
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording
 from dhtorch.data.units import DepthUnit
@@ -173,7 +172,7 @@ class _Load:
             level = files.read_image(self.confs[i], depth_hw)
             if level.shape[0] != 1 or level.max() > 2:
                 problem = f"{level.shape[0]} channels up to {level.max()}"
-                raise FormatError(self.confs[i], "confidence", problem, "1 channel of 0, 1 or 2")
+                raise files.FormatError(self.confs[i], "confidence", problem, "1 channel of 0, 1 or 2")
             conf = torch.from_numpy(level[0])
         return Frame(
             image=convert.rot90_image(image, self.turns)[None],
@@ -290,7 +289,7 @@ def _choose_pictures(root: Path, places: Sequence[Path], image: str | None) -> t
     for name in (image,) if image else _COLOUR_ASSETS:
         if (pictures := _list_asset_files(places, _COLOUR_ASSETS[name], "png")) is not None:
             return name, pictures
-    raise FormatError(root, image or "images", "none", "<video id>_<seconds>.png in a folder of that name")
+    raise files.FormatError(root, image or "images", "none", "<video id>_<seconds>.png in a folder of that name")
 
 
 def _match_assets(
@@ -300,7 +299,7 @@ def _match_assets(
     report = []
     depths = _list_asset_files(places, ("lowres_depth",), "png")
     if depths is None:
-        raise FormatError(root, "lowres_depth", "none", "<video id>_<seconds>.png in a folder of that name")
+        raise files.FormatError(root, "lowres_depth", "none", "<video id>_<seconds>.png in a folder of that name")
     depth = nearest_stamps(times, depths.times, max_difference)
     links = {"depth": _AssetMatch(depths, depth)}
     if (confs := _list_asset_files(places, ("confidence",), "png")) is None:
@@ -313,7 +312,9 @@ def _match_assets(
     lowres = _list_asset_files(places, ("lowres_wide_intrinsics",), "pincam")
     pincams = own or _list_asset_files(places, ("vga_wide_intrinsics",), "pincam") or lowres
     if pincams is None:
-        raise FormatError(root, f"{name}_intrinsics", "none, also of no other size", "<video id>_<seconds>.pincam")
+        raise files.FormatError(
+            root, f"{name}_intrinsics", "none, also of no other size", "<video id>_<seconds>.pincam"
+        )
     if own is not None:
         links["intrinsics"] = _AssetMatch(own, nearest_stamps(times, own.times, _SAME_INSTANT_S))
     else:

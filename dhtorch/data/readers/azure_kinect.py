@@ -23,7 +23,6 @@ from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.clocks import pair_stamps
 from dhtorch.data.codecs import video
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
@@ -88,32 +87,27 @@ def read(
     root = Path(root)
     tracks = _find_tracks(root)
     if tracks is None:
-        raise FormatError(root, "tracks", "no colour and depth track", "a Matroska video with both")
+        raise files.FormatError(root, "tracks", "no colour and depth track", "a Matroska video with both")
     headers = [video.read_video_header(root, track=track) for track in tracks]
     hw, depth_hw = (header.hw for header in headers)
-    option = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    files.refuse_if(
-        option.feature is not None, root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
-    )
+    camera, report = intrinsics_options.parse_camera(root, hw, intrinsics, K, fov)
     calibration = _read_calibration(root, hw, depth_hw)
-    if option.K is not None:
-        camera = convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
-    elif calibration is not None:
+    if camera is None and calibration is not None:
         camera = calibration[0].camera
-    else:
+    if camera is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, f"an attachment {_CALIBRATION} in the video")
     if calibration is None and hw != depth_hw:
         size = f"a depth track of {depth_hw[1]}x{depth_hw[0]} without {_CALIBRATION}"
-        raise FormatError(root, "depth", size, f"{hw[1]}x{hw[0]} as the colour track, or files of {_CONVERTER}")
+        raise files.FormatError(root, "depth", size, f"{hw[1]}x{hw[0]} as the colour track, or files of {_CONVERTER}")
     times = [video.read_video_times(root, track=track) for track in tracks]
     pairs = pair_stamps(*times)
     if not len(pairs):
         problem = f"{len(times[0])} pictures and {len(times[1])} depth maps, none within half a period"
-        raise FormatError(root, "time stamps", problem, "pairs")
+        raise files.FormatError(root, "time stamps", problem, "pairs")
     left_out = sorted(set(range(len(times[0]))) - set(pairs[:, 0].tolist()))
-    report = [*option.report, *files.format_left_out(left_out, "no depth map within half a period")]
+    lines = [*report, *files.format_left_out(left_out, "no depth map within half a period")]
     if calibration is None:
-        report.append(f"no {_CALIBRATION}: depth is taken as registered to colour")
+        lines.append(f"no {_CALIBRATION}: depth is taken as registered to colour")
     return [
         Recording(
             name=root.stem,
@@ -132,7 +126,7 @@ def read(
             root=root,
             times=torch.from_numpy(times[0][pairs[:, 0]]),
             rate_hz=headers[0].rate_hz,
-            report=tuple(report),
+            report=tuple(lines),
             depth_unit=DepthUnit(1 / _UNITS_PER_METRE, None if calibration is None else f"{root.name}: {_CALIBRATION}"),
         )
     ]
@@ -182,7 +176,7 @@ def _find_tracks(file: Path) -> _Tracks | None:
         return None
     try:
         tracks = video.list_video_tracks(file)
-    except FormatError:
+    except files.FormatError:
         return None
     names = [track.name.upper() for track in tracks]
     visible = [i for i, name in enumerate(names) if name not in ("IR", "INFRARED")]
@@ -206,12 +200,12 @@ def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]
     by_location = {str(entry.get("Location")): entry for entry in entries if isinstance(entry, dict)}
     locations = [f"CALIBRATION_CameraLocation{name}" for name in ("PV0", "D0")]
     if lost := [location for location in locations if location not in by_location]:
-        raise FormatError(where, "Cameras", ", ".join(by_location) or "none", lost[0])
+        raise files.FormatError(where, "Cameras", ", ".join(by_location) or "none", lost[0])
     colour, depth = (by_location[location] for location in locations)
     if depth_hw not in _DEPTH_MODES:
         size = f"{depth_hw[1]}x{depth_hw[0]}"
         expected = ", ".join(f"{w}x{h}" for h, w in _DEPTH_MODES)
-        raise FormatError(file, "depth size", size, f"one of {expected}, the modes of {_CALIBRATION}")
+        raise files.FormatError(file, "depth size", size, f"one of {expected}, the modes of {_CALIBRATION}")
     side, left, top = _DEPTH_MODES[depth_hw]
     return (
         _parse_lens(colour, _colour_grid(colour, hw, where), hw, where),

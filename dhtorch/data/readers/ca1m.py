@@ -26,7 +26,6 @@ from torch import Tensor
 from dhtorch.data import convert
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
 from dhtorch.data.units import DepthUnit
@@ -51,7 +50,7 @@ def recognise(root: Path) -> str | None:
         return None
     try:
         names = [member.name for member in islice(tarballs.iter_tar_members(root), 32)]
-    except FormatError:
+    except files.FormatError:
         return None
     members = {match[3].lower() for name in names if (match := _MEMBER_PATTERN.fullmatch(name))}
     return "a tar archive of <video>/<time>.wide and .gt members" if members & _KNOWN_MEMBERS else None
@@ -136,7 +135,7 @@ class _Load:
             value, largest = tiff.decode_tiff(data, file, hw).astype(np.float64), 2 if self.confidence == "level" else 1
             if not ((value >= 0) & (value <= largest)).all():
                 expected = f"0 to {largest} (option confidence: unit or level)"
-                raise FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
+                raise files.FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
             conf = torch.from_numpy(np.floor(value * (2 / largest) + 0.5).astype(np.uint8))[None]  # 0 low to 2 high
         return Frame(
             image=image[None],

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from dhtorch.data.codecs.colmap import parse_id, parse_numbers, read_colmap_cameras, read_colmap_images
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.image_folders import FrameFiles, format_names_left_out, open_posed
 from dhtorch.data.recording import Recording
 
@@ -59,11 +58,13 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
     model = _find_model(root)
     if model is None:
         command = "colmap model_converter --input_path sparse/0 --output_path sparse/0 --output_type TXT"
-        raise FormatError(root, "model", "no text model", f"cameras.txt and images.txt (of a binary one: {command})")
+        raise files.FormatError(
+            root, "model", "no text model", f"cameras.txt and images.txt (of a binary one: {command})"
+        )
     pictures = _find_folder(root, _IMAGE_FOLDERS) if images is None else Path(os.path.normpath(root / images))
     if pictures is None or not pictures.is_dir():
         problem = "none beside the model" if images is None else f"no folder {images}"
-        raise FormatError(root, "images", problem, "images/, or data.images=FOLDER and data.depth=FOLDER")
+        raise files.FormatError(root, "images", problem, "images/, or data.images=FOLDER and data.depth=FOLDER")
     maps = root / "depth" if depth is None else Path(os.path.normpath(root / depth))
     lenses = read_colmap_cameras(model / "cameras.txt")
     times, file = {}, model / "times.txt"  # dhtorch integrate writes the times of the images
@@ -75,8 +76,13 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
         if not image.is_file():
             missing.append(image)
             continue
-        if entry.camera_id not in lenses:
-            raise FormatError(model / "images.txt", f"camera of image {entry.image_id}", entry.camera_id, "a camera")
+        files.refuse_if(
+            entry.camera_id not in lenses,
+            model / "images.txt",
+            f"camera of image {entry.image_id}",
+            entry.camera_id,
+            "a camera",
+        )
         lens = lenses[entry.camera_id]
         candidates = (maps / f"{stem}{suffix}" for stem in (image.stem, image.name) for suffix in _DEPTH_SUFFIXES)
         rows.append(

@@ -24,7 +24,6 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data.codecs import npy
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
@@ -181,7 +180,7 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
                 try:
                     seconds = datetime.fromisoformat(stamp).timestamp()
                 except (ValueError, OverflowError):
-                    raise FormatError(scene, "id.timestamp", stamp, "an ISO 8601 time") from None
+                    raise files.FormatError(scene, "id.timestamp", stamp, "an ISO 8601 time") from None
                 shot = _Shot(
                     number=number,
                     stamp=seconds,

@@ -28,12 +28,10 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.image_folders import (
     FrameFiles,
     FrameLoader,
     list_images,
-    parse_option,
     read_depth_type,
     read_K,
     read_pose,
@@ -118,7 +116,7 @@ def read(
     frames, poses, report = _list_frames(root)
     hw = files.read_image_header(frames[0].image).hw
     depth_hw = read_depth_type(frames[0].depth)[0]
-    stated = parse_option(root, hw, intrinsics, K, fov)
+    stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov, features=False)
     colour_K = _read_intrinsics(root, "K", stated.K, meta)
     if colour_K is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, "a file K.txt, intrinsics.txt or meta.json")
@@ -133,7 +131,7 @@ def read(
     rate = None if value is None or isinstance(value, str) else files.to_positive(value, side_car, "fps")
     no_return = invalid if invalid is not None else meta.get("invalid", NO_DEPTH_CODES)
     if not isinstance(no_return, Sequence) or not all(isinstance(code, int) for code in no_return):
-        raise FormatError(side_car, "invalid", no_return, "a list of depth codes")
+        raise files.FormatError(side_car, "invalid", no_return, "a list of depth codes")
     number = torch.tensor([frame.number for frame in frames])
     times = None if rate is None else number.double() / rate
     if fps is None and "times" in meta:
@@ -193,16 +191,20 @@ def _list_frames(root: Path) -> tuple[list[FrameFiles], Pose | None, list[str]]:
         images, depths = list_images(folder), list_images(root / "depth")
         file = _first_existing(root, _POSE_FILES)
         rows = None if file is None else files.read_table(file)
-        if not images:
-            raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
+        files.refuse_if(not images, folder, "frames", "no image", "at least one .png or .jpg")
         # Rows have no names: they can be matched to images only if all counts are equal.
         counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
         for field, count in counts.items():
-            if count != len(images):
-                raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
+            files.refuse_if(
+                count != len(images),
+                root,
+                f"{field} count",
+                count,
+                f"{len(images)}, one for each file of {folder.name}/",
+            )
         if images.keys() != depths.keys():
             unpaired = min(images.keys() ^ depths.keys())
-            raise FormatError(
+            raise files.FormatError(
                 root, "file names", f"{unpaired} in one of {folder.name}/ and depth/", "the same names in both"
             )
         stems = list(images)
@@ -245,18 +247,18 @@ def _list_named_frames(root: Path) -> tuple[list[FrameFiles], Pose | None, list[
             report.append(f"frame {number}: its pose is not finite (tracking lost): left out")
         else:
             if matrix.shape != (4, 4):
-                raise FormatError(files_of["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
+                raise files.FormatError(files_of["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
             poses.append(matrix)
             frames.append(FrameFiles(number, files_of["color"], files_of["depth"]))
     if not frames:
         problem = f"none complete among {len(parts)}" if parts else "none"
         expected = "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt"
-        raise FormatError(root, "frames", problem, "; ".join([expected, *report[:1]]))
+        raise files.FormatError(root, "frames", problem, "; ".join([expected, *report[:1]]))
     if not has_poses:
         return frames, None, [*report, "no frame-XXXXXX.pose.txt: no poses"]
     try:
         return frames, convert.to_poses(np.stack(poses), root), report
-    except FormatError:  # check one by one, so that the error names the file
+    except files.FormatError:  # check one by one, so that the error names the file
         for frame, matrix in zip(frames, poses, strict=True):
             convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
         raise
@@ -266,8 +268,9 @@ def _parse_poses(rows: np.ndarray, file: Path) -> list[np.ndarray | None]:
     """Camera-to-world (4, 4) of each row, not finite where its row is not or has no rotation."""
     if rows.shape[1] == 16:
         return list(rows.reshape(-1, 4, 4))
-    if rows.shape[1] != 7:
-        raise FormatError(file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers")
+    files.refuse_if(
+        rows.shape[1] != 7, file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers"
+    )
     is_lost = ~np.isfinite(rows).all(-1) | ~rows[:, 3:].any(-1)
     c2w = convert.to_c2w(np.where(is_lost[:, None], [0, 0, 0, 1], rows[:, 3:]), rows[:, :3], file, "pose")
     c2w[is_lost] = np.nan

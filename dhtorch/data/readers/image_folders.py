@@ -21,7 +21,6 @@ from dhtorch.data import clocks, convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs import pgm, pickles, tiff
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
@@ -124,7 +123,7 @@ def _read_array(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
         values = values.reshape(values.shape[:2] if values.shape[2] == 1 else values.shape[1:])
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
         kind = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
-        raise FormatError(file, "depth", kind, "numbers of shape (height, width)")
+        raise files.FormatError(file, "depth", kind, "numbers of shape (height, width)")
     files.refuse_if(hw not in (None, values.shape), file, "depth", f"shape {values.shape}", f"shape {hw}")
     return values
 
@@ -185,19 +184,18 @@ def open_numbered(root: Path, format: str, parts: FolderParts, options: KOptions
     """
     rows, stated = parts.rows, parts.K
     hw, (depth_hw, _) = files.read_image_header(rows[0].image).hw, read_depth_type(rows[0].depth)
-    option, scaled = parse_option(root, hw, *options), tuple[str, ...]()
-    if option.K is not None:
-        camera = convert.to_camera(convert.make_K(*option.K), hw, root, "option K")
-    elif stated is None:
+    camera, guess = intrinsics_options.parse_camera(root, hw, *options)
+    if camera is None and stated is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, parts.K_file)
-    else:
+    scaled: tuple[str, ...] = ()
+    if camera is None and stated is not None:
         camera, scaled = _fit_camera(stated, hw)
         if rows[0].K is not None:  # equal matrices share one camera
             cameras = {K.tobytes(): convert.to_camera(K, hw, *stated[1:3]) for row in rows if (K := row.K) is not None}
             rows = [row if row.K is None else replace(row, camera=cameras[row.K.tobytes()]) for row in rows]
     depth_camera, depth_scaled = (None, ()) if parts.depth_K is None else _fit_camera(parts.depth_K, depth_hw)
     rows, lost = split_lost(rows)
-    lines, poses = [*parts.report, *scaled, *depth_scaled, *option.report, *lost], None
+    lines, poses = [*parts.report, *scaled, *depth_scaled, *guess, *lost], None
     if all(row.c2w is not None for row in rows):
         poses = convert.to_poses(np.stack([row.c2w for row in rows if row.c2w is not None]), parts.poses_file or root)
     else:
@@ -529,7 +527,7 @@ def read_K(file: Path) -> np.ndarray:
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
-        raise FormatError(file, "K", " ".join(words), expected) from None
+        raise files.FormatError(file, "K", " ".join(words), expected) from None
     if values.size == 4:
         return convert.make_K(*values)
     files.refuse_if(values.size not in (9, 12, 16), file, "K", f"{values.size} numbers", expected)
@@ -544,20 +542,6 @@ def read_pose(file: Path) -> np.ndarray:
 
 
 # ---------------------------------------------------------------------------------------------------------- cameras
-
-
-def parse_option(
-    root: Path,
-    hw: tuple[int, int],
-    intrinsics: intrinsics_options.IntrinsicsOption | None,
-    K: Sequence[float] | None,
-    fov: float | None,
-) -> intrinsics_options.ParsedIntrinsics:
-    """The options of a format without features; raises where they name one."""
-    option = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    expected = "fx fy cx cy, or degrees (the format has no features)"
-    files.refuse_if(option.feature is not None, root, "option intrinsics", option.feature, expected)
-    return option
 
 
 def _fit_camera(stated: StatedK, hw: tuple[int, int]) -> tuple[Camera, tuple[str, ...]]:
@@ -580,7 +564,12 @@ def fit_K(
     sizes = f"{hw[1]}x{hw[0]}", f"{stated_hw[1]}x{stated_hw[0]}"
     # Aspect ratios of one image at two sizes: rounding of the shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's
     # 1296×968 differs from 640×480 by 0.4 %.
-    if abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01:
-        raise FormatError(file, "image size", sizes[1], f"{sizes[0]} as the images, or the same aspect ratio (data.K)")
+    files.refuse_if(
+        abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01,
+        file,
+        "image size",
+        sizes[1],
+        f"{sizes[0]} as the images, or the same aspect ratio (data.K)",
+    )
     report = f"images of {sizes[0]}, {file.name} states K for {sizes[1]}: K is scaled"
     return convert.resize_K(K, stated_hw, hw), (report,)

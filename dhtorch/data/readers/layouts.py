@@ -61,7 +61,6 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.image_folders import (
     NAMED_COLOUR_PATTERN,
     FolderParts,
@@ -113,7 +112,7 @@ class Layout:
             root = Path(root)
             found = self.find(root)
             if found is None:
-                raise FormatError(root, "files", "none", self.expected)
+                raise files.FormatError(root, "files", "none", self.expected)
             parts = self.list_parts(root, found[1], **own)
             return [open_numbered(root, self.format, each, (intrinsics, K, fov), fps) for each in parts]
 
@@ -217,7 +216,7 @@ def _list_replica(root: Path, place: tuple[dict[int, Path], dict[int, Path], Pat
         document = files.read_json(file)
         camera = document.get("camera", document)
         if not isinstance(camera, dict):
-            raise FormatError(file, "camera", camera, "an object with w, h, fx, fy, cx, cy and scale")
+            raise files.FormatError(file, "camera", camera, "an object with w, h, fx, fy, cx, cy and scale")
         if "fx" in camera:
             values = files.to_array(
                 [camera.get(name) for name in ("fx", "fy", "cx", "cy")], (4,), file, "fx, fy, cx, cy"
@@ -370,7 +369,7 @@ def _find_open3d(root: Path) -> tuple[str, Any] | None:
         return None
     intrinsics_file = None
     for file in sorted(root.glob("*.json"), reverse=True):
-        with contextlib.suppress(FormatError):
+        with contextlib.suppress(files.FormatError):
             # Files with an intrinsic matrix hold under 1 kB; large ones are not searched at recognition.
             if file.is_file() and file.stat().st_size <= 100_000 and "intrinsic_matrix" in files.read_json(file):
                 intrinsics_file = file
@@ -379,7 +378,7 @@ def _find_open3d(root: Path) -> tuple[str, Any] | None:
     matched = [file for pattern in ("*traj*.log", "*traj*.txt", "*.log") for file in sorted(root.glob(pattern))]
     trajectories = []
     for file in dict.fromkeys(file for file in (*(root / name for name in named), *matched) if file.is_file()):
-        with contextlib.suppress(FormatError):
+        with contextlib.suppress(files.FormatError):
             rows = [words for _, words in files.read_rows(file)[:5]]
             is_block = [len(row) for row in rows] == [3, 4, 4, 4, 4]
             if is_block and all(word.lstrip("-").isdigit() for word in rows[0]):
@@ -435,7 +434,7 @@ def _read_log(file: Path) -> tuple[np.ndarray, np.ndarray]:
             ids.append([int(word) for word in head])
             matrices.append([[float(word) for word in words] for _, words in block])
         except ValueError:
-            raise FormatError(file, f"line {line}", " ".join(head), expected) from None
+            raise files.FormatError(file, f"line {line}", " ".join(head), expected) from None
         is_other = len(head) != 3 or any(len(words) != 4 for _, words in block)
         files.refuse_if(is_other, file, f"line {line}", " ".join(head), expected)
     return np.array(ids), np.array(matrices)

@@ -27,7 +27,6 @@ from dhtorch.data.clocks import nearest_stamps
 from dhtorch.data.codecs.parquet import read_cell
 from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_depth import (
     decode_depth_picture,
     dequantise_depth,
@@ -265,7 +264,7 @@ class _Load:
         nearest = int(nearest_stamps(targets, times, np.inf)[0])
         if abs(times[nearest] - targets[0]) > self.tolerance:
             problem = f"nearest frame at {times[nearest]:.6f} s"
-            raise FormatError(file, f"time {targets[0]:.6f} s", problem, f"one within {self.tolerance} s")
+            raise files.FormatError(file, f"time {targets[0]:.6f} s", problem, f"one within {self.tolerance} s")
         return read_video_frame(file, nearest, feature.hw, pixels=pixels)
 
     def _bytes(self, i: int, key: str) -> tuple[bytes, Path]:
@@ -357,7 +356,7 @@ def _read_cameras(
     side_car = root / "meta" / "intrinsics.json"
     entry = files.read_json(side_car).get(key, {}) if side_car.is_file() else {}
     if not isinstance(entry, dict):
-        raise FormatError(side_car, key, type(entry).__name__, "an object with K")
+        raise files.FormatError(side_car, key, type(entry).__name__, "an object with K")
     distortion = distortion if distortion is not None else entry.get("dist")
     depth_camera = None
     if depth is not None and (K_depth is not None or entry.get("K_depth") is not None):

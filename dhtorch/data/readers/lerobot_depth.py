@@ -17,7 +17,6 @@ from dhtorch.data.codecs.tiff import decode_tiff, decode_tiff_header
 from dhtorch.data.codecs.video import read_video_header
 from dhtorch.data.depth_codes import CODE_BITS, DEFAULT_RANGE, N_CODES, find_return_range, metres_by_code
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotFeature, LeRobotMeta, select_colour_keys
 from dhtorch.data.readers.lerobot_rows import read_encoded_image
 from dhtorch.data.units import UNIT_METRES, DepthUnit
@@ -83,7 +82,7 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
         return DepthUnit(UNIT_METRES["m" if is_float else "mm"])
     if not isinstance(stated, str) or stated not in UNIT_METRES:
         expected = f"one of {', '.join(UNIT_METRES)}"
-        raise FormatError(meta.root / "meta" / "info.json", f"{feature.key} {entry}", stated, expected)
+        raise files.FormatError(meta.root / "meta" / "info.json", f"{feature.key} {entry}", stated, expected)
     return DepthUnit(UNIT_METRES[stated], f"meta/info.json: {feature.key} {entry}")
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from dhtorch.data.codecs.parquet import read_columns
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 
 _MAX_EPISODES = 10_000_000
 _FILE_INDEX_COLUMNS = ("chunk_index", "file_index")
@@ -125,7 +124,7 @@ def read_lerobot_meta(root: Path) -> LeRobotMeta:
     text = files.get_entry(info, "codebase_version", str, file)
     version = re.fullmatch(r"v?([23])\.\d{1,3}", text)
     if not version:
-        raise FormatError(file, "codebase_version", text, "v2.x or v3.x")
+        raise files.FormatError(file, "codebase_version", text, "v2.x or v3.x")
     number = int(version[1])
     chunks = info.get("chunks_size", 1000)
     files.refuse_if(type(chunks) is not int or not 0 < chunks < 10**9, file, "chunks_size", chunks, "a positive number")
@@ -133,7 +132,7 @@ def read_lerobot_meta(root: Path) -> LeRobotMeta:
     paths = {key: info.get(key) or defaults[number - 2] for key, defaults in templates.items()}
     for key, value in paths.items():
         if not isinstance(value, str):
-            raise FormatError(file, key, type(value).__name__, "a path")
+            raise files.FormatError(file, key, type(value).__name__, "a path")
     features = files.get_entry(info, "features", dict, file)
     return LeRobotMeta(
         root=root,
@@ -160,7 +159,7 @@ def read_lerobot_episodes(meta: LeRobotMeta, wanted: Sequence[int] | None) -> Le
     missing = [n for n in selected if n not in row_of]
     if missing or not selected:
         problem = f"{len(selected) - len(missing)} of those requested"
-        raise FormatError(meta.root / "meta", "episodes", problem, missing or "at least one")
+        raise files.FormatError(meta.root / "meta", "episodes", problem, missing or "at least one")
     rows = np.array([row_of[n] for n in selected])
     episodes = LeRobotEpisodes(meta, np.array(selected), {name: values[rows] for name, values in columns.items()})
     _ = episodes[0]  # raises now for invalid paths
@@ -233,7 +232,7 @@ def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> 
     def fill(match: re.Match[str]) -> str:
         name, width = match[1], match[2]
         if name not in values or (width and isinstance(values[name], str)):
-            raise FormatError(file, key, match[0], f"one of {', '.join(values)}")
+            raise files.FormatError(file, key, match[0], f"one of {', '.join(values)}")
         return str(values[name]).zfill(int(width or 0))
 
     name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
@@ -249,7 +248,7 @@ def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
         or len(shape) > 8
         or any(type(n) is not int or not 0 <= n < 2**31 for n in shape)
     ):
-        raise FormatError(file, f"features.{key}.shape", shape, "a few counts")
+        raise files.FormatError(file, f"features.{key}.shape", shape, "a few counts")
     files.refuse_if(
         dtype in ("video", "image") and (len(shape) not in (2, 3) or not 0 < math.prod(shape) <= 4 * files.MAX_PIXELS),
         file,
@@ -259,7 +258,7 @@ def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
     )
     info = value.get("info") or value.get("video_info") or {}
     if not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."):
-        raise FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")
+        raise files.FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")
     return LeRobotFeature(key, dtype, tuple(shape), info)
 
 
@@ -270,8 +269,8 @@ def _check_counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODE
 def _check_numbers(values: Any, file: Path, field: str, is_valid: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """A column (n,) as float64, after checking that all values are numbers and valid."""
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
-        raise FormatError(file, field, "no numbers", "one number per row")
+        raise files.FormatError(file, field, "no numbers", "one number per row")
     column = values.astype(np.float64)
     if not (valid := is_valid(column)).all():
-        raise FormatError(file, field, column[~valid][0], "a count, or a time in s")
+        raise files.FormatError(file, field, column[~valid][0], "a count, or a time in s")
     return column

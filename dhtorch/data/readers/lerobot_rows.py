@@ -12,7 +12,6 @@ from dhtorch.data.clocks import format_numbers, nearest_stamps
 from dhtorch.data.codecs.parquet import read_cell, read_columns
 from dhtorch.data.codecs.video import read_video_times
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta
 from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime.console import format_count
@@ -41,7 +40,7 @@ def _read_cached_table(file: Path, _version: tuple[int, ...], extra: tuple[str, 
     index_columns = "timestamp", "frame_index", "episode_index"
     for name, values in read_columns(file, [index_columns[0], *extra], optional=index_columns[1:]).items():
         if not isinstance(values, np.ndarray):
-            raise FormatError(file, name, "no numbers", "numbers")
+            raise files.FormatError(file, name, "no numbers", "numbers")
         files.refuse_if(
             name in index_columns and values.size != len(values),
             file,
@@ -132,12 +131,12 @@ def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[byt
     """
     cell = read_cell(table, key, row)
     if not isinstance(cell, dict):
-        raise FormatError(table, key, type(cell).__name__, "an image: bytes and path")
+        raise files.FormatError(table, key, type(cell).__name__, "an image: bytes and path")
     data, path = cell.get("bytes"), cell.get("path")
     if isinstance(data, bytes) and data:
         return data, table
     if not isinstance(path, str):
-        raise FormatError(table, key, "neither bytes nor path", "an image")
+        raise files.FormatError(table, key, "neither bytes nor path", "an image")
     file = files.resolve_inside(root, path, table, key)
     return files.read_bytes(file), file
 
@@ -174,7 +173,7 @@ def pair_episode_videos(
     for key, (file, start) in videos.items():
         try:
             stamps, targets = find_row_stamps(file, start, times)
-        except (FormatError, ImportError):
+        except (files.FormatError, ImportError):
             continue
         nearest = nearest_stamps(targets, stamps, tolerance)
         if (nearest < 0).any() and start == 0 and len(stamps) == len(times) == numbers[-1] + 1:

@@ -25,7 +25,6 @@ import numpy as np
 
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.image_folders import FrameFiles, format_names_left_out, open_posed
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
@@ -81,7 +80,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     missing: list[Path] = []
     for k, entry in enumerate(files.get_entry(meta, "frames", list, file)):
         if not isinstance(entry, dict):
-            raise FormatError(file, f"frames.{k}", type(entry).__name__, "an object")
+            raise files.FormatError(file, f"frames.{k}", type(entry).__name__, "an object")
         image = resolve_image(folder, entry, file, k)
         if not image.is_file():
             missing.append(image)
@@ -100,8 +99,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
             for name in _DEPTH_FOLDERS
             if (folder / name).is_dir()
         ]
-    if not rows:
-        raise FormatError(file, "frames", "; ".join(report) or "none", "at least one image")
+    files.refuse_if(not rows, file, "frames", "; ".join(report) or "none", "at least one image")
     stating = next((name for name in _UNIT_KEYS if meta.get(name) is not None), None)
     unit = None
     if stating is not None:
@@ -176,10 +174,12 @@ def parse_lens(
     if model not in _PERSPECTIVE_MODELS or values.get("is_fisheye") is True:
         actual = "is_fisheye" if model in _PERSPECTIVE_MODELS else model
         expected = f"{', '.join(_PERSPECTIVE_MODELS)} (undistort other lenses first)"
-        raise FormatError(file, f"frames.{k}.camera_model", actual, expected)
+        raise files.FormatError(file, f"frames.{k}.camera_model", actual, expected)
     lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
     if k4 := _number(values, "k4", file, k, 0.0):
-        raise FormatError(file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)")
+        raise files.FormatError(
+            file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)"
+        )
     hw = None
     if "w" in values and "h" in values:  # the size that K refers to
         h, w = (files.to_positive(values[name], file, f"frames.{k}.{name}") for name in "hw")
@@ -189,7 +189,9 @@ def parse_lens(
     focal = {axis: _parse_focal(values, axis, size, file, k) for axis, size in (("x", hw[1]), ("y", hw[0]))}
     fx = focal["x"] if focal["x"] is not None else focal["y"]
     if fx is None:
-        raise FormatError(file, f"frames.{k}", "neither fl_x nor camera_angle_x", "the focal length of the images")
+        raise files.FormatError(
+            file, f"frames.{k}", "neither fl_x nor camera_angle_x", "the focal length of the images"
+        )
     fy = fx if focal["y"] is None else focal["y"]
     cx, cy = (_number(values, f"c{axis}", file, k, n / 2) for axis, n in (("x", hw[1]), ("y", hw[0])))
     return convert.make_K(fx, fy, cx - 0.5, cy - 0.5), hw, lens if any(lens) else None
@@ -202,8 +204,7 @@ def _parse_focal(values: Mapping[str, Any], axis: str, size: int, file: Path, k:
     if name not in values:
         return None
     angle = _number(values, name, file, k, 0.0)
-    if not 0 < angle < math.pi:
-        raise FormatError(file, f"frames.{k}.{name}", angle, "an angle in radians, 0 to pi")
+    files.refuse_if(not 0 < angle < math.pi, file, f"frames.{k}.{name}", angle, "an angle in radians, 0 to pi")
     return size / 2 / math.tan(angle / 2)
 
 
@@ -226,8 +227,7 @@ def _parse_pose(entry: Mapping[str, Any], undo: np.ndarray, file: Path, k: int) 
 def parse_matrix(value: Any, file: Path, field: str) -> np.ndarray:
     """3×4 or 4×4 numbers → (4, 4)."""
     n_rows = len(value) if isinstance(value, list) else 0
-    if n_rows not in (3, 4):
-        raise FormatError(file, field, f"{n_rows} rows", "3 or 4 rows of 4 numbers")
+    files.refuse_if(n_rows not in (3, 4), file, field, f"{n_rows} rows", "3 or 4 rows of 4 numbers")
     matrix = files.to_array(value, (n_rows, 4), file, field)
     return matrix if n_rows == 4 else np.vstack((matrix, [0.0, 0.0, 0.0, 1.0]))
 
@@ -240,8 +240,13 @@ def _parse_applied(meta: Mapping[str, Any], file: Path) -> tuple[np.ndarray, lis
         applied = parse_matrix(meta["applied_transform"], file, "applied_transform")
         R = applied[:3, :3]
         # Six printed digits leave an error of rounding.
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
-            raise FormatError(file, "applied_transform", R.tolist(), "a rotation and a translation")
+        files.refuse_if(
+            np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0,
+            file,
+            "applied_transform",
+            R.tolist(),
+            "a rotation and a translation",
+        )
     scale = files.to_positive(meta.get("applied_scale", 1.0), file, "applied_scale")
     if scale != 1:
         report.append(f"poses are stored times {scale:.6g} (applied_scale): undone")

@@ -15,7 +15,6 @@ import numpy as np
 
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.image_folders import FrameFiles, list_images, open_posed
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
@@ -53,7 +52,7 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
     root = Path(root)
     found = _find_folders(root)
     if found is None:
-        raise FormatError(root, "folders", "none", "keyframes/ with cameras/ and images/")
+        raise files.FormatError(root, "folders", "none", "keyframes/ with cameras/ and images/")
     keyframes, folders = found
     cameras, images = folders if corrected else ("cameras", "images")
     pictures, depths = list_images(keyframes / images), list_images(keyframes / "depth")

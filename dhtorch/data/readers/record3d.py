@@ -3,16 +3,25 @@
 - ``.r3d``: a zip archive (or its folder) with ``metadata``, ``rgbd/<i>.jpg``, ``.depth`` and ``.conf``, the latter two
   compressed with LZFSE: float32 metres and confidence 0, 1 or 2.
 - *EXR + RGB*: a folder with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``.
-- *RGBD mp4*: one video, read by :mod:`dhtorch.data.readers.record3d_video`.
+- *RGBD mp4*: one video; see below.
 
 Image, depth, pose and intrinsics of a frame share the number ``<i>``, which starts at 0 and has no leading zeros. Poses
 are camera-to-world with ARKit's axes (x right, y up, z backward) of the image *as stored*, portrait or landscape, so
 nothing is rotated here. Colour and depth are registered. Assumed, since undocumented: depth that is not finite or not
 positive is *no return*; time stamps count from the first one; ``initPose`` is not used.
+
+The RGBD mp4 has depth as hue in the left half of every image, colour in the right half.
+
+A pixel's hue (full saturation, full value) runs once round the circle from the nearest to the furthest depth, 0 to 3 m
+unless the file has another range. Both ends are red and cannot be distinguished, so they are dropped, and so are pixels
+next to a depth discontinuity: there the codec has blended two hues into a third one. Intrinsics are stored as JSON near
+the end of the file, behind the images, or in a ``metadata.json`` beside it; they refer to one half. There is no
+confidence and no pose.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -26,14 +35,13 @@ import torch
 
 from dhtorch.data import convert
 from dhtorch.data.codecs import exr as codec_exr
-from dhtorch.data.codecs import lzfse
+from dhtorch.data.codecs import lzfse, video
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.members import Member, list_folder_members, list_zip_members
-from dhtorch.data.readers import record3d_video
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes
-from dhtorch.records import Frame
+from dhtorch.records import Camera, Frame
+from dhtorch.runtime import safe_open as doors
 from dhtorch.runtime.console import format_count
 
 _MEMBER_PATTERN = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
@@ -44,6 +52,12 @@ _WHOLE_EXPORT = (
     "a whole export of Record3D: metadata with rgbd/<i>.jpg and .depth, or metadata.json with rgb/<i>.jpg and "
     "depth/<i>.exr; share it from the app again"
 )
+# of the RGBD mp4
+_METADATA_START = b'{"intrinsicMatrix"'
+_TAIL_BYTES = 1 << 20  # bytes at the end of the file that are searched for the intrinsics
+_DEFAULT_RANGE_M = (0.0, 3.0)  # m
+_KEPT_RANGE_RATIO = (0.1 / 3, 2.8 / 3)  # of the range, as kept by the app's own viewer
+
 _JPEG_MARKERS = (b"\xff\xd8", b"\xff\xd9")
 
 
@@ -52,7 +66,7 @@ def recognise(root: Path) -> str | None:
     if root.is_file():
         if root.suffix.lower() == ".r3d":
             return ".r3d archive"
-        return record3d_video.recognise(root)
+        return _recognise_film(root)
     inner = root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
     if (inner / "metadata.json").is_file() and (inner / "rgb").is_dir() and any((inner / "depth").glob("*.exr")):
         return "metadata.json, rgb/ and depth/*.exr"
@@ -96,17 +110,17 @@ def read(
     """
     root = Path(root)
     if root.is_file() and root.suffix.lower() != ".r3d":
-        return record3d_video.read(root, depth_range=depth_range, max_step=max_step)
+        return _read_film(root, depth_range, max_step)
     if root.is_file():
         members, inner, name = list_zip_members(root), root, root.stem
     elif root.is_dir():
         inner, name = root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root, root.resolve().name
         members = list_folder_members(inner)
     else:
-        raise FormatError(root, "path", "no such file or folder", "a Record3D capture")
+        raise files.FormatError(root, "path", "no such file or folder", "a Record3D capture")
     table = next((members[table] for table in ("metadata.json", "metadata") if table in members), None)
     if table is None:
-        raise FormatError(inner, "metadata", f"none among {format_count(len(members), 'file')}", _WHOLE_EXPORT)
+        raise files.FormatError(inner, "metadata", f"none among {format_count(len(members), 'file')}", _WHOLE_EXPORT)
     meta = _parse_metadata(table, per_frame)
     shots, report = _list_shots(members, inner)
     lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
@@ -209,10 +223,10 @@ def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
     file = table.path
     value = files.decode_json(table.read(), file)
     if not isinstance(value, dict):
-        raise FormatError(file, "JSON", type(value).__name__, "an object")
+        raise files.FormatError(file, "JSON", type(value).__name__, "an object")
     hw = _parse_size(value, "h", "w", file)
     if hw is None:
-        raise FormatError(file, "w, h", "nothing", "the size of the images")
+        raise files.FormatError(file, "w, h", "nothing", "the size of the images")
     coefficients = _parse_rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
     if coefficients is None:
         K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # stored by columns
@@ -225,7 +239,9 @@ def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
         )
         coefficients = np.array([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]])
     elif not np.isfinite(coefficients).all():
-        raise FormatError(file, "perFrameIntrinsicCoeffs", "a number that is not finite", "fx fy cx cy of each frame")
+        raise files.FormatError(
+            file, "perFrameIntrinsicCoeffs", "a number that is not finite", "fx fy cx cy of each frame"
+        )
     fps = value.get("fps")
     stamps = _parse_rows(value, "frameTimestamps", 1, file)
     return _Metadata(
@@ -262,7 +278,7 @@ def _parse_rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> n
     try:
         array = np.asarray(rows, dtype=np.float64).reshape(len(rows), width)
     except (TypeError, ValueError, OverflowError):
-        raise FormatError(file, key, rows, f"{width} numbers for each frame") from None
+        raise files.FormatError(file, key, rows, f"{width} numbers for each frame") from None
     return array
 
 
@@ -320,7 +336,7 @@ def _frame_times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | 
 
 def _find_sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
     """(height, width) of image and depth map, from the first frame whose headers can be read."""
-    first_error: FormatError | None = None
+    first_error: files.FormatError | None = None
     for shot in shots:
         try:
             hw = files.decode_image_header(shot.image.read(), shot.image.path).hw
@@ -332,12 +348,12 @@ def _find_sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], t
             count = lzfse.lzfse_unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
             if count / 4 not in _DEPTH_SIZES:
                 expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
-                raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
+                raise files.FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
             h, w = _DEPTH_SIZES[count // 4]
             return hw, ((h, w) if meta.hw[0] > meta.hw[1] else (w, h))
-        except FormatError as error:
+        except files.FormatError as error:
             first_error = first_error or error
-    raise first_error or FormatError(meta.file, "frames", "none", "at least one")
+    raise first_error or files.FormatError(meta.file, "frames", "none", "at least one")
 
 
 def _is_damaged(shot: _Shot) -> bool:
@@ -353,6 +369,134 @@ def _is_damaged(shot: _Shot) -> bool:
 def _can_decode(load: Callable[[int], Frame], i: int) -> bool:
     try:
         load(i)
-    except FormatError:
+    except files.FormatError:
         return False
     return True
+
+
+# ---------------------------------------------------------------------------------------------------------- RGBD mp4
+
+
+def _recognise_film(file: Path) -> str | None:
+    """The content by which ``file`` is recognised as an RGBD mp4, as text; None if it is not."""
+    if file.suffix.lower() != ".mp4":
+        return None
+    if _METADATA_START in _read_tail(file):
+        return "an mp4 with an intrinsicMatrix at its end"
+    side_car = file.parent / "metadata.json"
+    if side_car.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side_car, doors.MAX_TEXT_BYTES):
+        return "an mp4 beside a metadata.json with an intrinsicMatrix"
+    return None
+
+
+def _read_film(file: Path, depth_range: Sequence[float] | None, max_step: float) -> list[Recording]:
+    """Open one RGBD mp4."""
+    meta, source = _read_film_metadata(file)
+    header = video.read_video_header(file)
+    hw = (header.hw[0], header.hw[1] // 2)
+    K = files.to_array(meta.get("intrinsicMatrix", meta.get("K")), (9,), source, "intrinsicMatrix").reshape(3, 3).T
+    limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _DEFAULT_RANGE_M)
+    near, far = files.to_array(limits, (2,), source, "rangeOfEncodedDepth")
+    if not 0 <= near < far <= 1e4 or header.hw[1] % 2:
+        problem = f"{near} to {far} m in an image {header.hw[1]} px wide"
+        raise files.FormatError(source, "rangeOfEncodedDepth", problem, "two increasing depths, two halves")
+    camera = convert.to_camera(K, hw, source, "intrinsicMatrix")
+    load = partial(
+        _load_film_frame,
+        file=file,
+        hw=header.hw,
+        camera=camera,
+        near=float(near),
+        far=float(far),
+        max_step=files.to_positive(max_step, file, "option max_step"),
+    )
+    number = torch.arange(header.n)
+    stamps, remarks = video.read_video_times(file), list[str]()
+    times = None if header.rate_hz is None else number.double() / header.rate_hz
+    if len(stamps) == header.n:  # from the first frame on, s
+        times = torch.from_numpy(stamps - stamps[0])
+    else:
+        remarks = [f"the file has {len(stamps)} of {header.n} frames: times are those of the nominal rate"]
+    return [
+        Recording(
+            name=file.stem,
+            format="record3d",
+            load=load,
+            number=number,
+            root=file,
+            times=times,
+            rate_hz=header.rate_hz,
+            report=("no poses in this layout", *remarks),
+        )
+    ]
+
+
+def _load_film_frame(
+    i: int,
+    *,
+    file: Path,
+    hw: tuple[int, int],  # of the whole image, both halves
+    camera: Camera,
+    near: float,  # m
+    far: float,
+    max_step: float,
+) -> Frame:
+    """Position → frame."""
+    # Nearest: interpolating the half-size colour planes would blend hues.
+    picture = video.read_video_frame(file, i, hw, nearest=True)
+    half = hw[1] // 2
+    image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
+    depth = decode_hue_depth(picture[:, :half], near, far, max_step)
+    return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], camera)
+
+
+def decode_hue_depth(
+    rgb: np.ndarray,  # (h, w, 3) uint8
+    near: float,  # m, of hue 0
+    far: float,  # m, of hue 1
+    max_step: float,  # m
+) -> np.ndarray:
+    """Hues → depth (h, w) m float32; 0 near both ends of the range, beside a discontinuity and without hue."""
+    x = rgb.astype(np.float32)
+    r, g, b = x[..., 0], x[..., 1], x[..., 2]
+    top, chroma = x.max(-1), np.ptp(x, -1)
+    c = np.maximum(chroma, 1)
+    sixth = np.where(top == r, (g - b) / c % 6, np.where(top == g, (b - r) / c + 2, (r - g) / c + 4))
+    hue = sixth / 6
+    depth = near + hue * (far - near)
+    # of the maximum: coded pixels are saturated, grey has no hue
+    usable = (hue >= _KEPT_RANGE_RATIO[0]) & (hue < _KEPT_RANGE_RATIO[1]) & (chroma >= 255 * 0.25)
+    jump = np.maximum(_window_extreme(depth, np.maximum) - depth, depth - _window_extreme(depth, np.minimum)) > max_step
+    return np.where(usable & ~jump, depth, 0).astype(np.float32)
+
+
+def _window_extreme(x: np.ndarray, extreme: np.ufunc) -> np.ndarray:
+    """Largest or smallest value (``np.maximum``, ``np.minimum``) in the 3×3 window of every pixel."""
+    x = np.pad(x, 1, mode="edge")
+    x = extreme(extreme(x[:-2], x[1:-1]), x[2:])
+    return np.asarray(extreme(extreme(x[:, :-2], x[:, 1:-1]), x[:, 2:]))
+
+
+def _read_film_metadata(file: Path) -> tuple[dict[str, Any], Path]:
+    """The JSON object with the intrinsics, and the file that contains it."""
+    tail = _read_tail(file)
+    at = tail.rfind(_METADATA_START)
+    if at < 0:
+        side_car = file.parent / "metadata.json"
+        files.refuse_if(
+            not side_car.is_file(), file, "intrinsicMatrix", "neither in the file nor in a metadata.json", "one of them"
+        )
+        return files.read_json(side_car), side_car
+    try:  # other bytes follow
+        return json.JSONDecoder().raw_decode(tail[at:].decode("utf-8", errors="replace"))[0], file
+    except (ValueError, RecursionError) as error:
+        raise files.FormatError(file, "intrinsicMatrix", error, "a JSON object") from None
+
+
+def _read_tail(file: Path) -> bytes:
+    try:
+        with doors.open_regular(file) as stream:
+            stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
+            return stream.read()
+    except OSError as error:
+        raise files.FormatError(file, "file", error, "a readable file") from None

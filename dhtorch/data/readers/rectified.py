@@ -26,7 +26,6 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data.codecs import npy, pfm
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
@@ -144,7 +143,7 @@ def _read_calib_pair(root: Path) -> tuple[Path, _Pair]:
     maps = [[root / f"disp{i}.pfm", root / f"disp{i}GT.pfm"] for i in (0, 1)]
     first, second = (next((each for each in named if each.is_file()), None) for named in maps)
     if first is None:
-        raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
+        raise files.FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
     # Matlab's [a b c; d e f; g h i]
     matrices = [[row.split() for row in entries.get(f"cam{i}", "").strip("[]").split(";")] for i in (0, 1)]
     left, right = (convert.to_camera(matrix, hw, file, f"cam{i}") for i, matrix in enumerate(matrices))

@@ -28,7 +28,6 @@ from dhtorch.data.clocks import nearest_stamps
 from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.codecs.video import read_video_frame, read_video_header
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rh20t_robot import (
     ROBOT_ARMS,
     RobotArm,
@@ -99,7 +98,7 @@ def read(
     meta = files.read_json(root / "metadata.json")
     stamp = meta.get("calib", -1)
     if isinstance(stamp, bool) or not isinstance(stamp, int | str) or not re.fullmatch(r"\d{10,16}", str(stamp)):
-        raise FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = none)")
+        raise files.FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = none)")
     parent = root.parent.parent if root.parent.name == "action" else root.parent
     folder = (Path(calibration) if calibration is not None else parent / "calib") / str(stamp)
     hw = files.to_array(calibrated_hw, (2,), root, "option calibrated_hw")
@@ -117,7 +116,7 @@ def read(
     )
     present = sorted(d.name[4:] for d in root.glob("cam_*") if d.is_dir())
     if unknown := sorted(set(serials or ()) - set(present)):
-        raise FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
+        raise files.FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
     incomplete = {} if serials else {s: reason for s in present if (reason := rig.lacks(s))}
     opened = [s for s in serials or present if s not in incomplete]
     files.refuse_if(
@@ -230,7 +229,7 @@ class _SceneCameras:
         K = value if isinstance(value, np.ndarray) else None
         if K is None or K.shape not in ((3, 3), (3, 4)) or K.dtype.kind not in "fiu" or (K[:, 3:] != 0).any():
             problem = type(value).__name__ if K is None else f"an array of shape {K.shape}"
-            raise FormatError(file, serial, problem, "3x3 intrinsics, or 3x4 with a zero column")
+            raise files.FormatError(file, serial, problem, "3x3 intrinsics, or 3x4 with a zero column")
         files.refuse_if(
             hw[0] * self.hw[1] != hw[1] * self.hw[0],
             file,
@@ -247,7 +246,7 @@ class _SceneCameras:
         value = self.E.get(serial)
         first = value[0] if isinstance(value, list | np.ndarray) and len(value) else None
         if not isinstance(first, np.ndarray) or first.shape != (4, 4) or first.dtype.kind != "f":
-            raise FormatError(file, serial, type(first).__name__, "a list of 4x4 matrices")
+            raise files.FormatError(file, serial, type(first).__name__, "a list of 4x4 matrices")
         convert.to_poses(first[None].astype(np.float64), file, serial)
         return first.astype(np.float64)
 
@@ -312,7 +311,7 @@ class _SceneCameras:
 
 def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> RobotArm | None:
     if configuration is not None and configuration not in ROBOT_ARMS:
-        raise FormatError(root, "option configuration", configuration, "1 to 7")
+        raise files.FormatError(root, "option configuration", configuration, "1 to 7")
     match = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
     number = configuration or (int(match[1]) if match else None)
     if number is None:
@@ -323,7 +322,7 @@ def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | No
 def _read_by_serial(file: Path) -> dict[str, Any]:
     value = read_npy(file)
     if not isinstance(value, dict):
-        raise FormatError(file, "content", type(value).__name__, "a dict by camera serial")
+        raise files.FormatError(file, "content", type(value).__name__, "a dict by camera serial")
     return {str(key): entry for key, entry in value.items()}
 
 
@@ -333,7 +332,7 @@ def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -
     if isinstance(stamps, np.ndarray):
         stamps = stamps.tolist()
     if not isinstance(stamps, list) or not stamps:
-        raise FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
+        raise files.FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
     if len(stamps) != n:
         counts = f"{format_count(len(stamps), f'{kind} stamp')} for {format_count(n, 'frame')}"
         notes.append(f"{counts}: the first {min(n, len(stamps))} are used")

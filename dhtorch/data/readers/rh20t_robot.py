@@ -15,7 +15,6 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 
 _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -184,7 +183,9 @@ def ms_to_seconds(value: Any, file: Path, field: str) -> float:
     """
     # the year 2100
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 4_102_444_800_000:
-        raise FormatError(file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds")
+        raise files.FormatError(
+            file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds"
+        )
     return value / 1000
 
 
@@ -214,16 +215,16 @@ def _iter_entries(file: Path, lists: list[Any], field: str, width: int | None) -
     """(time in s, values) of the entries with the field; without non-finite values and zero poses."""
     for entries in lists:
         if not isinstance(entries, list):
-            raise FormatError(file, "entries", type(entries).__name__, "a list for each camera")
+            raise files.FormatError(file, "entries", type(entries).__name__, "a list for each camera")
         for entry in entries:
             if not isinstance(entry, dict) or "timestamp" not in entry:
-                raise FormatError(file, "entries", "something else", "objects with a timestamp")
+                raise files.FormatError(file, "entries", "something else", "objects with a timestamp")
             time, value = ms_to_seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
             if value is None:
                 continue
             value = _parse_vector(value, file, field)
             if width is not None and len(value) != width:
-                raise FormatError(file, field, f"{len(value)} numbers", width)
+                raise files.FormatError(file, field, f"{len(value)} numbers", width)
             if np.isfinite(value).all() and (field != "tcp" or np.linalg.norm(value[3:]) > 1e-6):
                 yield time, value
 
@@ -240,12 +241,12 @@ def _parse_vector(value: Any, file: Path, field: str) -> np.ndarray:
     is_list = isinstance(value, list | tuple) and all(isinstance(x, int | float) for x in value)
     flat = np.array(value) if is_list else value if isinstance(value, np.ndarray) else None
     if flat is None or flat.dtype.kind not in "fiu" or flat.ndim != 1 or len(flat) > 64:
-        raise FormatError(file, field, type(value).__name__, "a vector of numbers")
+        raise files.FormatError(file, field, type(value).__name__, "a vector of numbers")
     return flat.astype(np.float64)
 
 
 def _check_mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
     """Checked dict; with ``texts`` its keys as strings, since a serial may be stored as a number."""
     if not isinstance(value, dict):
-        raise FormatError(file, field, type(value).__name__, "a dict")
+        raise files.FormatError(file, field, type(value).__name__, "a dict")
     return {str(key): entry for key, entry in value.items()} if texts else value

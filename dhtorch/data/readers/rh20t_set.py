@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
 from dhtorch.data.recording import Recording, Recordings
@@ -51,7 +50,7 @@ def open_set(
     scenes = list(_list_scenes(base, camera))[:limit]
     if not scenes:
         expected = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"
-        raise FormatError(base, "scenes", "none", expected)
+        raise files.FormatError(base, "scenes", "none", expected)
     options = {"max_difference": max_difference, "max_gap": max_gap, "outlier": outlier}
     names = [f"{folder.name}/{serial}" for folder, serial in scenes]
     depth = None if depth_root is None else Path(depth_root)

@@ -26,7 +26,6 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
@@ -100,7 +99,7 @@ def read(
 
     def find(key: str, option: str, chosen: str | None, *names: str) -> str | None:
         if chosen is not None and chosen not in features:
-            raise FormatError(root, f"option {option}", chosen, f"one of {', '.join(features)}")
+            raise files.FormatError(root, f"option {option}", chosen, f"one of {', '.join(features)}")
         return chosen or next((name for name in names if name != key and name in features), None)
 
     rigs = []
@@ -145,7 +144,7 @@ class StepFeature:
 def _flatten(node: Any, name: str, features: dict[str, StepFeature], file: Path, depth: int) -> None:
     """Add the features below ``node`` of the feature tree to ``features``, names joined by ``/``."""
     if not isinstance(node, dict) or depth > 32:
-        raise FormatError(file, name or _STEPS_FEATURE, type(node).__name__, "a feature")
+        raise files.FormatError(file, name or _STEPS_FEATURE, type(node).__name__, "a feature")
     if isinstance(inner := node.get("featuresDict"), dict):
         for key, value in files.get_entry(inner, "features", dict, file).items():
             _flatten(value, f"{name}/{key}" if name else key, features, file, depth + 1)
@@ -165,7 +164,7 @@ def _parse_shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]
     try:
         dimensions = tuple(int(size) for size in sizes)
     except (TypeError, ValueError):
-        raise FormatError(file, f"{name} shape", sizes, "whole numbers") from None
+        raise files.FormatError(file, f"{name} shape", sizes, "whole numbers") from None
     files.refuse_if(
         len(dimensions) > 8 or any(not -1 <= size <= files.MAX_PIXELS for size in dimensions),
         file,
@@ -187,7 +186,7 @@ def _select_colour(root: Path, features: dict[str, StepFeature], camera: str | S
     not_colour = [name for name in names if name not in colour_features]
     if not_colour or not names:
         expected = f"one of {', '.join(colour_features)}" if colour_features else "a feature with colour images"
-        raise FormatError(root, "option camera", ", ".join(not_colour) or "no camera", expected)
+        raise files.FormatError(root, "option camera", ", ".join(not_colour) or "no camera", expected)
     return names
 
 
@@ -200,7 +199,7 @@ def _picture_size(root: Path, features: dict[str, StepFeature], key: str) -> tup
     body = tfrecord.read_record(place.file, place.span)
     pictures = tfrecord.parse_example(body, place.file, place.span.offset).get(f"{_STEPS_FEATURE}/{key}")
     if pictures is None or pictures.kind != "bytes" or not pictures.spans:
-        raise FormatError(place.file, key, "no images", "encoded images")
+        raise files.FormatError(place.file, key, "no images", "encoded images")
     return files.decode_image_header(tfrecord.read_span(place.file, pictures.spans[0]), place.file).hw
 
 
@@ -221,14 +220,14 @@ def _locate_episodes(root: Path, split: str | None, numbers: int | Sequence[int]
         if match := _SHARD_PATTERN.match(file.name):
             shards.setdefault(match["split"], []).append(file)
     if split is not None and split not in shards:
-        raise FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
+        raise files.FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
     selected = None if numbers is None else {numbers} if isinstance(numbers, int) else {int(each) for each in numbers}
     locations: list[RecordLocation] = []
     n_before = 0
     for name in sorted(shards) if split is None else [split]:
         places = [(file, span) for file in shards[name] for span in tfrecord.index_records(file)]
         if selected is not None and (missing := selected - set(range(len(places)))):
-            raise FormatError(root, "option episode", min(missing), f"0 to {len(places) - 1} in {name}")
+            raise files.FormatError(root, "option episode", min(missing), f"0 to {len(places) - 1} in {name}")
         locations += [
             RecordLocation(name, i, n_before + i, *at)
             for i, at in enumerate(places)
@@ -351,7 +350,7 @@ def _open_camera(
 def _pictures(file: Path, example: Example, key: str) -> tuple[tfrecord.ByteSpan, ...]:
     feature = example.get(f"{_STEPS_FEATURE}/{key}")
     if feature is None or feature.kind != "bytes":
-        raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded images")
+        raise files.FormatError(file, key, "nothing" if feature is None else "numbers", "encoded images")
     return feature.spans
 
 
@@ -369,11 +368,11 @@ def _depths(
     single = len(shape) == 2 or (len(shape) == 3 and shape[2] == 1)
     if described.dtype != "float32" or described.encoded or not single or min(h, w) < 1:
         stored = f"{described.dtype} {shape}"
-        raise FormatError(root / "features.json", key, stored, "16-bit images, or float32 (h, w)")
+        raise files.FormatError(root / "features.json", key, stored, "16-bit images, or float32 (h, w)")
     size = 4 * h * w
     whole = feature is not None and feature.kind == "float" and len(feature.spans) == 1
     if feature is None or not whole or feature.spans[0].length != n * size:
-        raise FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
+        raise files.FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
     return tuple(tfrecord.ByteSpan(feature.spans[0].offset + i * size, size) for i in range(n))
 
 
@@ -385,7 +384,7 @@ def _numbers(
     feature = example.get(f"{_STEPS_FEATURE}/{key}")
     if feature is None or size not in sizes:
         expected = " or ".join(map(str, sizes))
-        raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
+        raise files.FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
     values = tfrecord.read_feature_numbers(file, key, feature, n * size)
     files.refuse_if(len(values) != n * size, file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
     return values.reshape(n, size).astype(np.float64)

@@ -95,22 +95,19 @@ class EpisodeSteps:
             data = tfrecord.read_span(self.place.file, tfrecord.ByteSpan(at, 4 * size * len(steps)))
             values = np.frombuffer(data, "<f4")
         else:
-            values = self._whole(name, feature, size)[size * steps.start : size * steps.stop]
+            # The numbers of all steps (n · size), decoded once and cached
+            if name not in self.numbers:
+                whole = tfrecord.read_feature_numbers(self.place.file, name, feature, size * self.n)
+                refuse_if(
+                    len(whole) != size * self.n,
+                    self.place.file,
+                    name,
+                    f"{len(whole)} numbers",
+                    f"{size} for each of {self.n} steps",
+                )
+                self.numbers[name] = whole.astype(self.features[name].dtype)
+            values = self.numbers[name][size * steps.start : size * steps.stop]
         return values.astype(described.dtype).reshape(len(steps), size)
-
-    def _whole(self, name: str, feature: tfrecord.ExampleFeature, size: int) -> np.ndarray:
-        """The numbers of all steps (n · size), decoded once and cached."""
-        if name not in self.numbers:
-            whole = tfrecord.read_feature_numbers(self.place.file, name, feature, size * self.n)
-            refuse_if(
-                len(whole) != size * self.n,
-                self.place.file,
-                name,
-                f"{len(whole)} numbers",
-                f"{size} for each of {self.n} steps",
-            )
-            self.numbers[name] = whole.astype(self.features[name].dtype)
-        return self.numbers[name]
 
     @property
     def about(self) -> dict[str, Any]:

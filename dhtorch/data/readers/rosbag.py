@@ -31,7 +31,6 @@ from dhtorch.data.codecs import ros_images
 from dhtorch.data.codecs.bags import BAG_SIGNATURES, MessagePlace, Topic, read_message, read_signature
 from dhtorch.data.codecs.ros_messages import parse_message
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rosbag_index import (
     BagIndex,
     ImageStream,
@@ -98,7 +97,7 @@ def read(
     for pair in others:
         try:
             recordings.append(_open_pair(bag, pair, K_options=(None, None, None), use_poses=poses))
-        except FormatError as error:
+        except files.FormatError as error:
             remarks.append(f"camera {pair.colour.base} left out: {error}")
     if remarks:
         recordings[0] = replace(recordings[0], report=(*recordings[0].report, *remarks))
@@ -121,7 +120,9 @@ def _choose_pairs(bag: BagIndex, color: str | None, depth: str | None) -> list[_
     colours, depths = _candidates(bag, color, "colour"), _candidates(bag, depth, "depth")
     if not colours or not depths:
         missing = "colour" if not colours else "depth"
-        raise FormatError(bag.root, f"{missing} topic", bag.format_topics(), "sensor_msgs/Image or CompressedImage")
+        raise files.FormatError(
+            bag.root, f"{missing} topic", bag.format_topics(), "sensor_msgs/Image or CompressedImage"
+        )
     scored = sorted(((_score(a, b), a, b) for a in colours for b in depths), key=lambda entry: entry[0], reverse=True)
     pairs: list[_Pair] = []
     for score, a, b in scored:
@@ -140,7 +141,7 @@ def _candidates(bag: BagIndex, name: str | None, kind: str) -> list[ImageStream]
         stream = bag.streams[name]
         if stream.kind != kind:
             actual = f"{name} of encoding {stream.encoding}"
-            raise FormatError(bag.root, option, actual, f"pictures of {option.removeprefix('option ')}")
+            raise files.FormatError(bag.root, option, actual, f"pictures of {option.removeprefix('option ')}")
         return [stream]
     streams = [s for s in bag.streams.values() if s.kind == kind]
     return [s for s in streams if kind == "depth" or not _NO_COLOUR.search(s.base.lower())] or streams
@@ -185,13 +186,8 @@ def _open_pair(
 ) -> Recording:
     colour, depth = pair.colour, pair.depth
     hw, depth_hw = colour.hw, depth.hw
-    option = intrinsics_options.parse_intrinsics(bag.root, hw, *K_options)
-    files.refuse_if(
-        option.feature is not None, bag.root, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
-    )
-    camera, remarks = find_camera(bag, colour) if option.K is None else (None, [])
-    if option.K is not None:
-        camera = convert.to_camera(convert.make_K(*option.K), hw, bag.root, "option K")
+    camera, guess = intrinsics_options.parse_camera(bag.root, hw, *K_options)
+    camera, remarks = find_camera(bag, colour) if camera is None else (camera, [])
     if camera is None:
         raise intrinsics_options.missing_intrinsics_error(bag.root, None, f"a CameraInfo of {colour.base}")
     own_camera, depth_remarks = find_camera(bag, depth)
@@ -201,9 +197,9 @@ def _open_pair(
     pairs = pair_stamps(*((stamps - origin) / 1e9 for stamps in times))
     if not len(pairs):
         problem = f"{len(times[0])} pictures of {colour.topic.name}, {len(times[1])} of {depth.topic.name}, none paired"
-        raise FormatError(bag.root, "time stamps", problem, "stamps within half a period")
+        raise files.FormatError(bag.root, "time stamps", problem, "stamps within half a period")
     left_out = sorted(set(range(len(times[0]))) - set(pairs[:, 0].tolist()))
-    report = [*option.report, *remarks, *depth_remarks, *related]
+    report = [*guess, *remarks, *depth_remarks, *related]
     report += files.format_left_out(left_out, f"no depth of {depth.topic.name} within half a period")
     c2w, pairs, pose_remarks = _find_poses(bag, colour, times[0], pairs, use_poses)
     unit = _depth_unit(bag, depth)
@@ -244,7 +240,9 @@ def _relate(
             remark = f"{pair.depth.topic.name} has no CameraInfo: taken as registered to {pair.colour.topic.name}"
             return None, None, [] if pair.registered else [remark]
         size = f"{depth_hw[1]}x{depth_hw[0]}"
-        raise FormatError(bag.root, pair.depth.topic.name, f"depth of {size} without a CameraInfo", "one beside it")
+        raise files.FormatError(
+            bag.root, pair.depth.topic.name, f"depth of {size} without a CameraInfo", "one beside it"
+        )
     T: np.ndarray | None = np.eye(4)
     if not pair.registered:
         T = _find_extrinsics(bag, pair)

@@ -17,7 +17,6 @@ from dhtorch.data.codecs import ros_images
 from dhtorch.data.codecs.bags import HEAD_BYTES, IndexedMessage, MessagePlace, Topic, iter_messages, read_message
 from dhtorch.data.codecs.ros_messages import parse_message, stamp_ns
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rosbag_transforms import Transform, TransformTree
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera
@@ -154,7 +153,7 @@ def _describe_stream(message: IndexedMessage, head: Any, *, compressed: bool) ->
         image = ros_images.strip_depth_header(bytes(whole.data), is_depth)
         try:
             header = files.decode_image_header(image, Path(f"{file}{topic.name}"))
-        except FormatError:  # a video's packet, RVL
+        except files.FormatError:  # a video's packet, RVL
             return stream
         stream.hw, stream.channels = header.hw, header.channels
     else:
@@ -185,7 +184,7 @@ def find_camera(bag: BagIndex, stream: ImageStream) -> tuple[Camera | None, list
     if hw != stream.hw:
         h, w = stream.hw
         if abs(w * hw[0] - h * hw[1]) > max(h, w):  # more than a pixel off the calibration's aspect
-            raise FormatError(where, "width, height", f"{hw[1]}x{hw[0]}", f"{w}x{h} as {stream.topic.name}")
+            raise files.FormatError(where, "width, height", f"{hw[1]}x{hw[0]}", f"{w}x{h} as {stream.topic.name}")
         K = convert.resize_K(K, hw, stream.hw)
         remarks.append(f"{stream.topic.name}: K of {hw[1]}x{hw[0]} pixels is scaled to {w}x{h}")
     return convert.to_camera(K, stream.hw, where, "P" if is_rectified else "K", D), remarks

@@ -30,7 +30,6 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs.hdf5 import Hdf5Array, list_hdf5_group, read_hdf5_text
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame, Pose
@@ -47,7 +46,7 @@ def recognise(root: Path) -> str | None:
     try:
         episodes = _list_episodes(root)
         cameras = _list_cameras(root, episodes[0]) if episodes else []
-    except FormatError:
+    except files.FormatError:
         return None
     return f"HDF5 episodes {episodes[0]} … with depth of {cameras[0].name}" if cameras else None
 
@@ -85,10 +84,10 @@ def read(
     )
     chosen = cameras if camera is None else [camera] if isinstance(camera, str) else list(camera)
     if unknown := [name for name in chosen if name not in cameras]:
-        raise FormatError(root, "option camera", ", ".join(unknown), f"among {', '.join(cameras)}")
+        raise files.FormatError(root, "option camera", ", ".join(unknown), f"among {', '.join(cameras)}")
     planes = None if clip_planes is None else files.to_array(clip_planes, (2,), root, "option clip_planes")
     if planes is not None and not 0 < planes[0] < planes[1]:
-        raise FormatError(root, "option clip_planes", planes.tolist(), "0 < near < far")
+        raise files.FormatError(root, "option clip_planes", planes.tolist(), "0 < near < far")
     entries = [(episode, name) for episode in episodes for name in chosen]
     names = [f"{root.stem}/{episode.rpartition('/')[2]}/{name}" for episode, name in entries]
     return Recordings(
@@ -130,23 +129,17 @@ def _make_recording(
     episode, name = entries[i]
     arrays = next((entry for entry in _list_cameras(file, episode) if entry.name == name), None)
     if arrays is None:
-        raise FormatError(file, episode, f"no depth of {name}", "that of the first episode's cameras")
+        raise files.FormatError(file, episode, f"no depth of {name}", "that of the first episode's cameras")
     n, hw = _check_shapes(arrays)
     info = _read_camera_info(file, episode, name)
-    option = intrinsics_options.parse_intrinsics(file, hw, *K_options)
-    files.refuse_if(
-        option.feature is not None, file, "option intrinsics", option.feature, "four numbers fx, fy, cx, cy"
-    )
-    if option.K is not None:
-        camera = convert.to_camera(convert.make_K(*option.K), hw, file, "option K")
-    elif arrays.K is not None:
-        array = arrays.K
+    camera, guess = intrinsics_options.parse_camera(file, hw, *K_options)
+    if camera is None and (array := arrays.K) is not None:
         files.refuse_if(array.shape[1:] != (3, 3), array.file, array.key, f"an array of {array.shape}", "steps x 3 x 3")
         matrices = _to_pixel_centres(_read_rows(array, n))
         camera = convert.to_cameras(matrices, hw, array.file, array.key, None)
-    elif "intrinsics" in info:
+    elif camera is None and "intrinsics" in info:
         camera = convert.to_camera(_to_pixel_centres(info["intrinsics"]), hw, file, "camera_info intrinsics")
-    else:
+    if camera is None:
         raise intrinsics_options.missing_intrinsics_error(file, name)
     is_whole = arrays.depth.dtype.kind in "iu"
     load = partial(
@@ -168,7 +161,7 @@ def _make_recording(
         poses=_read_poses(arrays, n, info),
         episode=number,
         camera_name=name,
-        report=option.report,
+        report=guess,
         depth_unit=DepthUnit(1 / arrays.codes_per_metre, f"{arrays.layout}: definition of its depth")
         if is_whole
         else None,
@@ -323,5 +316,5 @@ def _read_camera_info(file: Path, episode: str, camera: str) -> dict[str, Any]:
     value = {} if text is None else files.decode_json(text, file)
     entry = value.get(camera, {}) if isinstance(value, dict) else {}
     if not isinstance(entry, dict):
-        raise FormatError(file, "camera_info", json.dumps(entry)[:60], "an object with intrinsics and extrinsics")
+        raise files.FormatError(file, "camera_info", json.dumps(entry)[:60], "an object with intrinsics and extrinsics")
     return entry

@@ -28,7 +28,6 @@ from dhtorch.data.clocks import FilmPairing, format_numbers, pair_film
 from dhtorch.data.codecs import pickles
 from dhtorch.data.codecs.video import read_video_frame, read_video_header, read_video_times
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.orientation import orientation_scores
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes, describe_mismatch
@@ -93,7 +92,7 @@ def read(
     rows, report = _read_odometry(root / "odometry.csv")
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
-        raise FormatError(video, "file", "no such file", "the images (data.images=false reads depth only)")
+        raise files.FormatError(video, "file", "no such file", "the images (data.images=false reads depth only)")
     header = None if video is None else read_video_header(video, all_frames=True)
     stated_hw = None
     if K_hw is not None:
@@ -201,7 +200,7 @@ class _Load:
         code = pickles.read_npy(shot.depth)
         if not isinstance(code, np.ndarray) or code.dtype != np.uint16 or code.shape != self.depth_hw:
             actual = f"{getattr(code, 'dtype', type(code).__name__)} of shape {getattr(code, 'shape', None)}"
-            raise FormatError(shot.depth, "depth", actual, f"uint16 of shape {self.depth_hw}")
+            raise files.FormatError(shot.depth, "depth", actual, f"uint16 of shape {self.depth_hw}")
         return code.astype(np.float32) / np.float32(_UNITS_PER_METRE)
 
     def _conf(self, file: Path) -> np.ndarray:
@@ -218,7 +217,7 @@ def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_lines(file))]
     except csv.Error as error:
-        raise FormatError(file, "table", error, "comma-separated columns") from None
+        raise files.FormatError(file, "table", error, "comma-separated columns") from None
     lines = [line for line in lines if any(line)]
     head = lines[0] if lines else []
     files.refuse_if(
@@ -261,7 +260,7 @@ def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
         own = [_parse_number(cells.get(name, ""), file, f"row {place} {name}") for name in _INTRINSICS_COLUMNS]
         row = _Row(place, int(number), value["timestamp"], c2w, np.array(own) if np.isfinite(own).all() else None)
         if rows and row.number <= rows[-1].number:
-            raise FormatError(file, f"row {place} frame", row.number, f"a number beyond {rows[-1].number}")
+            raise files.FormatError(file, f"row {place} frame", row.number, f"a number beyond {rows[-1].number}")
         rows.append(row)
     return rows, report
 
@@ -270,7 +269,7 @@ def _parse_number(cell: str, file: Path, field: str) -> float:
     try:
         return float(cell) if cell else float("nan")
     except ValueError:
-        raise FormatError(file, field, cell, "a number") from None
+        raise files.FormatError(file, field, cell, "a number") from None
 
 
 # ------------------------------------------------------------------------------------------------------------- frames
@@ -307,7 +306,11 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
             return int(h), int(w)
         except ValueError as failure:
             error = error or failure
-    raise error if isinstance(error, FormatError) else FormatError(shots[0].depth, "depth", error, "a depth map")
+    raise (
+        error
+        if isinstance(error, files.FormatError)
+        else files.FormatError(shots[0].depth, "depth", error, "a depth map")
+    )
 
 
 # ---------------------------------------------------------------------------------------------- rows and the pictures
@@ -360,7 +363,7 @@ def _choose_pairing(
         if not is_clear:
             shortage = f"{-surplus} pictures less than rows at a constant rate, which does not show the lost ones"
             expected = "stamps with gaps, or data.lost_first=true (the film lacks its first ones) or false (its last)"
-            raise FormatError(load.video or load.root, "frames", shortage, expected)
+            raise files.FormatError(load.video or load.root, "frames", shortage, expected)
         first_lost, reason = bool(leads[0] < 0), "by the edges of depth and image"
     lost = f"its {'first' if first_lost else 'last'} frame{'s are' if surplus < -1 else ' is'} lost"
     return (late if first_lost else early), f"{lost} ({reason})"
@@ -375,7 +378,7 @@ def _edge_leads(load: _Load, early: FilmPairing, late: FilmPairing) -> np.ndarra
         try:
             depth = torch.from_numpy(load.depth(shot))
             pictures = [load.picture(int(p.picture[shot.row.place])).transpose(2, 0, 1) for p in (early, late)]
-        except FormatError:
+        except files.FormatError:
             continue
         scores = [float(orientation_scores(torch.from_numpy(picture), depth, (0,))) for picture in pictures]
         leads.append(scores[0] - scores[1])

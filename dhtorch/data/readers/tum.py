@@ -24,7 +24,6 @@ import torch
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import image_folders
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
@@ -120,7 +119,7 @@ def read(
     pairs = associate([t for t, _ in colour], [t for t, _ in depth], max_difference)
     if not pairs:
         problem = f"{len(colour)} images and {len(depth)} depth maps, none within {max_difference} s of one another"
-        raise FormatError(root, "time stamps", problem, "pairs")
+        raise files.FormatError(root, "time stamps", problem, "pairs")
     times = np.array([colour[i][0] for i, _ in pairs])
     report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference, is_numbered)
     hw = files.read_image_header(colour[pairs[0][0]][1]).hw
@@ -215,14 +214,23 @@ def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool
         rows = [(root / kind, i, [stem, f"{kind}/{pictures[stem].name}"]) for i, stem in enumerate(pictures)]
     by_stamp: dict[float, Path] = {}
     for file, line, words in rows:
-        if len(words) != 2 or not re.fullmatch(r"\d+(\.\d*)?", words[0]):
-            raise FormatError(file, f"line {line}", " ".join(words) or "nothing", "a time stamp and a file name")
+        files.refuse_if(
+            len(words) != 2 or not re.fullmatch(r"\d+(\.\d*)?", words[0]),
+            file,
+            f"line {line}",
+            " ".join(words) or "nothing",
+            "a time stamp and a file name",
+        )
         picture = Path(words[1])
-        if picture.is_absolute() or ".." in picture.parts:
-            raise FormatError(file, f"line {line}", words[1], "a file inside the sequence's folder")
+        files.refuse_if(
+            picture.is_absolute() or ".." in picture.parts,
+            file,
+            f"line {line}",
+            words[1],
+            "a file inside the sequence's folder",
+        )
         by_stamp.setdefault(float(words[0]), root / picture)
-    if not by_stamp:
-        raise FormatError(root, f"{kind} frames", "none", f"time-stamped images in {kind}/")
+    files.refuse_if(not by_stamp, root, f"{kind} frames", "none", f"time-stamped images in {kind}/")
     # Stamps of digits alone are frame numbers below this limit; as seconds it is 11 days after 1970. Source: chosen.
     is_numbered = all(words[0].isdigit() for _, _, words in rows) and max(by_stamp) < 1e6
     return sorted(by_stamp.items()), is_numbered
@@ -232,8 +240,9 @@ def _match_numbers(file: Path, numbers: np.ndarray, max_difference: float) -> tu
     """Camera-to-world matrices of the frames whose number has a row, and the mask (n,) of these frames."""
     rows = {row[0]: row for row in _read_trajectory(file)}
     covered = np.array([number in rows for number in numbers])
-    if not covered.any():
-        raise FormatError(file, "frame numbers", "none of the images", f"{numbers[0]:g} to {numbers[-1]:g}")
+    files.refuse_if(
+        not covered.any(), file, "frame numbers", "none of the images", f"{numbers[0]:g} to {numbers[-1]:g}"
+    )
     kept = np.stack([rows[number] for number in numbers[covered]])
     return convert.to_c2w(kept[:, 4:], kept[:, 1:4], file), covered
 
@@ -243,8 +252,7 @@ def _read_trajectory(file: Path) -> np.ndarray:
     rows = files.read_table(file, 8)
     rows = rows[np.isfinite(rows).all(-1) & (np.linalg.norm(rows[:, 4:], axis=-1) > 1e-6)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
-    if len(rows) == 0:
-        raise FormatError(file, "poses", "no usable row", "rows of stamp, position and quaternion")
+    files.refuse_if(len(rows) == 0, file, "poses", "no usable row", "rows of stamp, position and quaternion")
     return rows
 
 
@@ -261,8 +269,9 @@ def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float
     # Largest interval in s between two poses to interpolate in: across longer ones tracking was lost.
     interpolated = (weight >= 0) & (weight <= 1) & (span < 0.05)
     covered = interpolated | (nearest < max_difference)
-    if not covered.any():
-        raise FormatError(file, "time stamps", f"no pose within {max_difference} s of any image", "overlapping clocks")
+    files.refuse_if(
+        not covered.any(), file, "time stamps", f"no pose within {max_difference} s of any image", "overlapping clocks"
+    )
     weight = np.where(interpolated, weight, nearest_weight)[covered, None]
     a, b = a[covered], b[covered]
     # q and −q are one rotation; over 10 ms or less linear interpolation of quaternions equals slerp.
@@ -281,9 +290,8 @@ def _find_camera(
 ) -> tuple[Camera, tuple[str, ...], str | None, bool]:
     """Camera of a sequence, report, data set whose unit of depth is documented, whether its trajectory has y up."""
     if isinstance(intrinsics, str) and intrinsics not in ("camera", "ros"):
-        raise FormatError(root, "option intrinsics", intrinsics, "camera or ros")
-    if camera not in (None, "icl", *_CAMERA_CALIBRATIONS):
-        raise FormatError(root, "option camera", camera, "1, 2, 3 or icl")
+        raise files.FormatError(root, "option intrinsics", intrinsics, "camera or ros")
+    files.refuse_if(camera not in (None, "icl", *_CAMERA_CALIBRATIONS), root, "option camera", camera, "1, 2, 3 or icl")
     number = camera if isinstance(camera, int) else None if camera == "icl" else _find_camera_number(root)
     is_icl = camera == "icl" or (camera is None and number is None and _is_icl(root))
     data_set = "ICL-NUIM" if is_icl else None if number is None else "TUM RGB-D"
@@ -301,8 +309,9 @@ def _find_camera(
         matrix, scaled = image_folders.fit_K(convert.make_K(*_ICL_INTRINSICS), _IMAGE_HW, hw, Path("ICL-NUIM"))
         return convert.to_camera(matrix, hw, root), (*scaled, *report), data_set, True
     elif number is not None or intrinsics != "camera":
-        if hw != _IMAGE_HW:
-            raise FormatError(root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration")
+        files.refuse_if(
+            hw != _IMAGE_HW, root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration"
+        )
         values, distortion = _ROS_INTRINSICS, None
         if number and intrinsics == "camera":
             values, distortion = _CAMERA_CALIBRATIONS[number]
@@ -327,11 +336,10 @@ def _read_calibration(file: Path) -> tuple[list[float], np.ndarray | None]:
     try:
         values = [float(word) for word in words]
     except ValueError:
-        raise FormatError(file, "numbers", " ".join(words), expected) from None
+        raise files.FormatError(file, "numbers", " ".join(words), expected) from None
     if len(values) == 9 and values[6:] == [0, 0, 1]:
         return [values[0], values[4], values[2], values[5]], None
-    if len(values) not in (4, 8, 9):
-        raise FormatError(file, "numbers", " ".join(words), expected)
+    files.refuse_if(len(values) not in (4, 8, 9), file, "numbers", " ".join(words), expected)
     return values[:4], np.array(values[4:]) if values[4:] else None
 
 

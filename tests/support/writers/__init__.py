@@ -6,32 +6,36 @@ They share no code with the decoders: PNG bytes, for example, are assembled here
 """
 
 from dhtorch.synthetic.rh20t import write_rh20t
-from support.writers.arkitscenes import write_arkitscenes
-from support.writers.ca1m import write_ca1m
 from support.writers.captures import CAPTURE_WRITERS, CaptureWriter
 from support.writers.image_folders import (
     write_bop,
+    write_calib_pair,
+    write_colmap_capture,
+    write_counted_frames,
+    write_driving,
     write_icl_nuim,
+    write_named_frames,
+    write_nerfstudio,
+    write_npz_pair,
     write_open3d,
+    write_polycam,
     write_replica,
     write_ros_tum,
     write_scannet,
     write_sens_folder,
     write_sun3d,
-)
-from support.writers.layouts import (
-    write_calib_pair,
-    write_counted_frames,
-    write_driving,
-    write_named_frames,
-    write_npz_pair,
     write_tum,
 )
 from support.writers.lerobot import write_lerobot
-from support.writers.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
-from support.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from support.writers.phones import (
+    write_arkitscenes,
+    write_ca1m,
+    write_r3d,
+    write_record3d_exr,
+    write_record3d_mp4,
+    write_stray,
+)
 from support.writers.rlds import write_rlds
-from support.writers.stray import write_stray
 
 __all__ = [
     "CAPTURE_WRITERS",

@@ -9,14 +9,18 @@ from typing import Final
 
 from dhtorch.export.stray import ARKIT_UP, turn_world
 from dhtorch.records import Frame
-from support.writers import image_folders, layouts
-from support.writers.arkitscenes import write_arkitscenes
-from support.writers.ca1m import write_ca1m
+from support.writers import image_folders
+from support.writers.image_folders import write_colmap_capture, write_nerfstudio, write_polycam
 from support.writers.lerobot import write_lerobot
-from support.writers.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
-from support.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from support.writers.phones import (
+    write_arkitscenes,
+    write_ca1m,
+    write_r3d,
+    write_record3d_exr,
+    write_record3d_mp4,
+    write_stray,
+)
 from support.writers.rlds import write_rlds
-from support.writers.stray import write_stray
 
 #: Range of depth of the Record3D film in m, which limits its step: 8 m in 1530 hues. Source: chosen for rooms.
 _MP4_RANGE_M = (0.0, 8.0)
@@ -54,9 +58,9 @@ class CaptureWriter:
 
 #: Layout → its writer. Frames have B = 1, image and depth of one size unless the reader accepts others.
 CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
-    "named_frames": CaptureWriter(layouts.write_named_frames, "frames_dir", 1 / 1000, states_unit=False),
-    "counted_frames": CaptureWriter(layouts.write_counted_frames, "frames_dir", 1 / 1000, states_unit=False),
-    "tum": CaptureWriter(layouts.write_tum, "tum", 1 / 5000, states_unit=False),
+    "named_frames": CaptureWriter(image_folders.write_named_frames, "frames_dir", 1 / 1000, states_unit=False),
+    "counted_frames": CaptureWriter(image_folders.write_counted_frames, "frames_dir", 1 / 1000, states_unit=False),
+    "tum": CaptureWriter(image_folders.write_tum, "tum", 1 / 5000, states_unit=False),
     "ros_tum": CaptureWriter(
         lambda root, frames: image_folders.write_ros_tum(root, frames, units_per_metre=5000),
         "tum",
