@@ -7,8 +7,6 @@ arguments; both implementations then answer the same calls in turn. Where kornia
 the formula that it replaced.
 """
 
-from __future__ import annotations
-
 import statistics
 import sys
 from collections.abc import Callable

@@ -6,8 +6,6 @@ Objects are kept in a folder of the temporary directory by the digest of the sou
 build's own folder, and of the options.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

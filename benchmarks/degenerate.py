@@ -7,8 +7,6 @@ kind: exceptions, pairs that break a promise of the records, share of pairs with
 and how far those answers are from what the reference view's pixels really show.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections import Counter
@@ -45,7 +43,7 @@ class Batch:
     uv: Tensor  # (B, N, 2) px
     truth: Tensor  # (B, H, W) m
 
-    def one(self, b: int) -> Batch:
+    def one(self, b: int) -> "Batch":
         """Pair ``b`` alone."""
         s = slice(b, b + 1)
         parts = (self.reference[s], self.other[s], self.uv[s], self.truth[s])

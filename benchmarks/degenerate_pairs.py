@@ -5,8 +5,6 @@ noise that is the same from both sides; depth is exact up to 1 % of noise and re
 made. ``truth`` is what the reference view's pixels really show, NaN where a pair has no such thing.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +29,7 @@ NAN, INF = math.nan, math.inf
 class Pair:
     """One pair in the making (B = 1)."""
 
-    room: Room
+    room: "Room"
     draw: Random
     g: torch.Generator
     image_0: Tensor  # (3, H, W)

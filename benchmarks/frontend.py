@@ -11,8 +11,6 @@ which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -16,8 +16,6 @@ Errors: median relative depth error over the same candidates, on either device. 
 or pixels with another gate than on the CPU, ``change_sigma`` the median change of depth in units of sigma.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 import warnings

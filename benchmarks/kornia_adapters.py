@@ -10,8 +10,6 @@ its depth, where a loader would crop or resize both) and its intrinsics are not:
 comparison.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -13,8 +13,6 @@ Errors of forward rows: share of points more than 1 px from where a known warp o
 Errors of forward-backward rows: share of points of the real pairs on which the two verdicts differ.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -8,8 +8,6 @@ kept of every frame adds up with their number, whatever the picture's size. Said
 above that of the first 100 frames, in MiB.
 """
 
-from __future__ import annotations
-
 import resource
 import sys
 from collections.abc import Iterable

@@ -14,8 +14,6 @@ be learned.
 Errors: median rotation error in degrees over a hundred pairs; that of the translation is printed above the table.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections.abc import Callable, Iterator

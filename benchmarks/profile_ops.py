@@ -8,8 +8,6 @@ Stages: sample, backproject, classify, track, pose, triangulate, score. One pair
 set, else of the built-in room.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from functools import partial

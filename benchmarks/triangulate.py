@@ -8,8 +8,6 @@ four equations of each point. The pose is exact; pixels of view 1 have 0.3 px of
 Errors: median relative error of depth.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

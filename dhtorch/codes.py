@@ -7,8 +7,6 @@ A code is one entry: ``NAME: Final = code(number, definition, …)``. Descriptio
 new code has a text everywhere and, until ``viz.plots.colours`` defines one for it, a default colour.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final

@@ -5,8 +5,6 @@ through ``torch.func``, ``torch.compile(fullgraph=True)``, pickling and data-loa
 ``None``. There is no tensor subclass and there are no operators.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, Self, TypeVar, dataclass_transform

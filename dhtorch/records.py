@@ -4,8 +4,6 @@ Missing values: an unanswered element holds a defined value, and a code gives th
 a return is 0 and its ``xyz`` NaN; ``depth`` and ``sigma`` of an unanswered estimate are NaN and its ``score`` 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -114,11 +112,11 @@ class TrackHint:
     flows: tuple[CoarseFlow, CoarseFlow] | None = None  # coarse flow of the whole image, to image 1 and back
     between: Sequence[Tensor] | Tensor | None = None  # K × (B, C, H, W), images between image 0 and 1, in their order
 
-    def replace(self, **changes: Any) -> TrackHint:
+    def replace(self, **changes: Any) -> "TrackHint":
         """A copy with some fields replaced."""
         return replace(self, **changes)
 
-    def __getitem__(self, part: slice) -> TrackHint:
+    def __getitem__(self, part: slice) -> "TrackHint":
         """The hint for a slice of the pairs."""
         start = None if self.start is None else self.start[part]
         pyramid = None if self.pyramid is None else self.pyramid[part]
@@ -159,7 +157,7 @@ class PoseFit(Record):
         """(B,) bool: there is a pose."""
         return (self.code == PoseCode.OK) | (self.code == PoseCode.KEPT_PNP)
 
-    def without_pose(self, rejected: Tensor, code: Tensor | int) -> PoseFit:
+    def without_pose(self, rejected: Tensor, code: Tensor | int) -> "PoseFit":
         """The fit without the ``rejected`` (B,) poses, which get ``code``. Gradient: to the poses that stay."""
 
         def mask(x: Tensor) -> Tensor:
@@ -234,12 +232,12 @@ class SigmaBudget(Record):
         return torch.where(terms.isfinite().all(0), Cause.TRACK + terms.argmax(0), Cause.NONE).int()
 
     @classmethod
-    def single(cls, term: str, variance: Tensor) -> SigmaBudget:
+    def single(cls, term: str, variance: Tensor) -> "SigmaBudget":
         """A budget with all ``variance`` in one term."""
         zero = torch.zeros_like(variance)
         return cls(zero, zero, zero, zero, zero).replace(**{term: variance})
 
-    def scaled_to(self, sigma: Tensor) -> SigmaBudget:
+    def scaled_to(self, sigma: Tensor) -> "SigmaBudget":
         """The terms in the same proportions with sum ``sigma``²; all in ``model`` where there are no proportions.
 
         Gradient: to sigma and to the terms.
@@ -310,7 +308,7 @@ class Estimate(Record):
         return depth_interval(self.depth, self.sigma, k)
 
     @classmethod
-    def unanswered(cls, samples: Samples, gate: int, *, n_views: int) -> Estimate:
+    def unanswered(cls, samples: Samples, gate: int, *, n_views: int) -> "Estimate":
         """An estimate in which every sample is unanswered, rejected by the same gate."""
         nan = torch.full_like(samples.depth, torch.nan)
         zero = torch.zeros_like(samples.depth)

@@ -5,8 +5,6 @@ Elements without a label, masked or behind the camera cost nothing.
 What has no value is replaced before arithmetic, so that its gradient is exactly zero and never NaN.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

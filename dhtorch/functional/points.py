@@ -6,8 +6,6 @@ into the camera, ``x = R X + t``. Wrong shapes raise kornia's ``ShapeError``; po
 never dropped. The page docs/upstream.md has scope, reviewers' requests and oracles of each function.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

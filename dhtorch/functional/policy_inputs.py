@@ -16,8 +16,6 @@ changes depth by at most the share depth / (510 · ``NEAREST_M``), to first orde
 by 1.4 % more.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

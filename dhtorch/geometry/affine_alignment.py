@@ -15,8 +15,6 @@ steps determine it, and the third includes part of those to follow (Anderson 196
 The steps on one level have a compiled kernel.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

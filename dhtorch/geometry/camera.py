@@ -7,8 +7,6 @@ Pixel convention of the whole project: *integer coordinates are pixel centres*; 
 (0, 0) and the image spans [-0.5, W - 0.5] × [-0.5, H - 0.5].
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import torch
@@ -54,7 +52,7 @@ class Camera(Record):
     readout: Tensor | None = None  # (B,) s from first to last row (rolling shutter); None = global shutter
 
     @classmethod
-    def from_kornia(cls, camera: PinholeCamera | CameraModelBase, distortion: Tensor | None = None) -> Camera:
+    def from_kornia(cls, camera: "PinholeCamera | CameraModelBase", distortion: Tensor | None = None) -> "Camera":
         """The intrinsics of a camera of kornia; the pose of a ``PinholeCamera`` is ``Pose.from_kornia``.
 
         Numbers are used unchanged: kornia leaves the position of pixel centres to the caller; here they are at whole
@@ -86,7 +84,7 @@ class Camera(Record):
         params = model.params.reshape(-1, model.params.shape[-1])
         return cls(params[:, :2], params[:, 2:4], params[:, 4:] if isinstance(model, BrownConradyModel) else distortion)
 
-    def to_kornia(self, hw: tuple[int, int], T_cam_from_world: Pose | None = None) -> PinholeCamera:
+    def to_kornia(self, hw: tuple[int, int], T_cam_from_world: Pose | None = None) -> "PinholeCamera":
         """As a ``kornia.geometry.camera.PinholeCamera`` of images of size ``hw``; distortion is dropped.
 
         Its extrinsics map points of the world into the camera; None = the world is the camera's frame.

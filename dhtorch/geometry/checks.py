@@ -3,8 +3,6 @@
 *Shapes raise, values flag*: a wrong shape is an error of the caller and raises here, with the argument's name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any

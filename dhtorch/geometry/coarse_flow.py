@@ -13,8 +13,6 @@ All sums are of integers that a float represents exactly: the result depends on 
 batch, the number of threads or the device.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

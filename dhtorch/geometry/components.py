@@ -3,8 +3,6 @@
 Alphabet: maps (B, h, w) bool. Pixels are connected to their four neighbours.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

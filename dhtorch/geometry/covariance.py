@@ -3,8 +3,6 @@
 Alphabet: ``H`` = Σ w Jᵀ J in px² per tangent unit², ``xi`` = (rotation rad, translation m), left perturbation.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

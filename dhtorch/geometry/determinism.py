@@ -14,8 +14,6 @@ points that are processed at once (:data:`MAX_CHUNK_POINTS`) affects speed only:
 changes no bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

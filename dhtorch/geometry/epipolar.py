@@ -6,8 +6,6 @@ pinhole; the two cameras may differ. Coordinates are separate (B, N) planes: eac
 cannot depend on the batch.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

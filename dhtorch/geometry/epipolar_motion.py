@@ -4,8 +4,6 @@ Alphabet: ``x``, ``y`` unit rays (B, 3, N) of view 0 and view 1; ``b`` = Rᵀ y;
 translation in axes of view 0, for which s · (x × b) = 0.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -5,8 +5,6 @@ Grey values and Gaussian blur are kornia's; filters of few taps are sums of shif
 Alphabet: ``x`` (B, C, H, W); ``taps`` weights along one axis, odd in number. Beyond the border its pixels repeat.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

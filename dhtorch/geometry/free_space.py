@@ -5,8 +5,6 @@ scene. Where the object partly moves with the camera, epipolar residuals do not 
 too small, within the range of a sensor that has no return there.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@
 results are copied. No bit of a result depends on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeVar
 

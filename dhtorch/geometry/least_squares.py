@@ -6,8 +6,6 @@ H = Σ w Jᵀ J and g = Σ w Jᵀ r. Points are *planes* (B, 3, N) and (B, 2, N)
 is contiguous over points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, TypeVar

@@ -8,8 +8,6 @@ Products are sums of products, not calls of ``matmul``: their rounding does not 
 (:mod:`dhtorch.geometry.determinism`). The order of every sum is part of the definition.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

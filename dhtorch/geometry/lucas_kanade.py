@@ -14,8 +14,6 @@ Coarse levels only provide a start: there the points of a small *cell* of the im
 The whole search has a compiled kernel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Alphabet: T carries points of the reference into the other ("live") camera; xi =
 perturbation. Everything is float64.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -12,8 +12,6 @@
 A true depth that equals one of these values by accident becomes a hole of one pixel. No value is capped.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

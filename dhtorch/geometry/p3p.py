@@ -7,8 +7,6 @@ last, so that each operation is contiguous over triples; few operations on many 
 hypotheses of one pair an operation costs more than what it computes.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.linalg import cross

@@ -4,8 +4,6 @@ Alphabet: ``image`` (B, C, H, W); ``uv`` (B, N, 2) px; ``pixel`` (B, N, 2) int32
 ``corner`` (B, N, 2) integer (u, v) of a patch's top-left pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any

@@ -13,8 +13,6 @@ The resampling includes lens distortion and the rotation of a rolling shutter; n
 All costs are integers: they depend on no order of summation, so not on batch, threads, tiles or device.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch

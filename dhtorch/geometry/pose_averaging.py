@@ -4,8 +4,6 @@ Alphabet: V measurements ``T_v`` with covariances ``C_v`` of their left perturba
 mean T; ``d_v²`` = xi_vᵀ C_v⁻¹ xi_v.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

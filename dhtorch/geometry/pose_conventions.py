@@ -4,8 +4,6 @@ Alphabet: ``M`` takes our camera axes (x right, y down, z forward) to those of a
 motion ``T`` in the other axes is Mᵀ T M in ours. The numbers alone do not determine the convention; near returns do.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import torch

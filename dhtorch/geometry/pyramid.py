@@ -5,8 +5,6 @@ the source of a search, its gradients along x and y. Pixel i of a level lies at 
 2 i of the level below it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -142,7 +140,7 @@ class PyramidCache:
                 self._cached[key] = make(self.image)
         return self._cached[key]
 
-    def __getitem__(self, part: slice) -> PyramidCache:
+    def __getitem__(self, part: slice) -> "PyramidCache":
         start, stop, _ = part.indices(len(self.image))
         if (start, stop) not in self._parts:
             self._parts[start, stop] = PyramidCache(self.image[start:stop])

@@ -4,8 +4,6 @@ Alphabet: B pairs, H drawn triples, K candidate poses, M points in M *slots*: th
 order, ``count`` (B,) of them. Points are planes (B, 3, M) and (B, 2, M). Nothing here carries a gradient.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -16,8 +16,6 @@ odometry", 2014, and P. Proença, Y. Gao, "SPLODE", 2018; rows with a motion of 
 shutter bundle adjustment", 2012.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple

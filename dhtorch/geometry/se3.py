@@ -5,8 +5,6 @@ chained: ``compose(T_c_from_b, T_b_from_a)``. Tangent ``xi = (rotation rad, tran
 ``T ← exp(xi) · T``. kornia's ``Se3`` puts translation first; the order is changed in :func:`exp` alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +27,7 @@ class Pose(Record):
     t: Tensor  # (B, 3) m
 
     @classmethod
-    def from_kornia(cls, motion: Any) -> Pose:
+    def from_kornia(cls, motion: Any) -> "Pose":
         """A ``kornia.geometry.liegroup.Se3``, or ``T_cam_from_world`` of a ``kornia.geometry.camera.PinholeCamera``.
 
         Gradient: to the motion.
@@ -37,7 +35,7 @@ class Pose(Record):
         extrinsics = getattr(motion, "extrinsics", None)
         return cls(motion.so3.matrix(), motion.t) if extrinsics is None else from_matrix(extrinsics)
 
-    def to_kornia(self) -> Se3:
+    def to_kornia(self) -> "Se3":
         """As a ``kornia.geometry.liegroup.Se3``, whose tangents have the translation first, here it is last.
 
         Gradient: to the motion.

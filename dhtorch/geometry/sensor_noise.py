@@ -5,8 +5,6 @@ capture's format is only a hint (:func:`sensor_of_format`) and changes nothing. 
 surfaces at right angles, not for one device: a device measured by its owner is stated as three numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 

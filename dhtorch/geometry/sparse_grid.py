@@ -5,8 +5,6 @@ that keys sort as positions do. A sorted list of keys is searched by bisection: 
 result that does not depend on the order of the points.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -8,8 +8,6 @@ the aperture, ``c`` diameter of the spot (px). The spot grows with the distance 
 so c is positive beyond the focus and negative in front of it. An image determines |c| alone.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@
 Alphabet: maps (B, h, w); a window of *radius* r has (2 r + 1)² pixels. Beyond the border its pixels repeat.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -25,8 +25,6 @@ Without an argument: compile the operators for this processor and print the path
 not possible.
 """
 
-from __future__ import annotations
-
 import sys
 
 from dhtorch.ops import builder, loader

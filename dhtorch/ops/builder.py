@@ -4,8 +4,6 @@
 (``hatch_build.py``) all levels of its platform. Nothing else compiles, and nothing is downloaded.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

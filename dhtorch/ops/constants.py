@@ -4,8 +4,6 @@
 kernel is an argument.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from dhtorch import codes

@@ -18,8 +18,6 @@ Eligible are plain contiguous CPU tensors of the stated dtypes that are not bein
 gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import wraps

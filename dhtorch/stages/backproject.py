@@ -3,8 +3,6 @@
 A sample without a usable return is NaN and flagged, never filled from its neighbours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple

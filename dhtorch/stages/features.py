@@ -7,8 +7,6 @@ Alphabet: a pair has M matches, ``uv_0`` to ``uv_1`` (M, 2) px with the local mo
 K nearest of them, at offsets ``o`` (N, K, 2) px, which predict it at ``p`` (N, K, 2) px.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,7 +42,7 @@ def match_features(
     image_1: Tensor,  # (B, C, H', W')
     uv_0: Tensor,  # (B, N, 2) px
     *,
-    matcher: Matcher,
+    matcher: "Matcher",
     hint: TrackHint = NO_HINT,
     neighbours: int = 12,
     reach: float = 0.1,
@@ -115,7 +113,7 @@ def match_features(
 
 
 def _find_matches(
-    matcher: Matcher,
+    matcher: "Matcher",
     image_0: Tensor,  # (1, C, H, W) float in [0, 1]
     image_1: Tensor,  # (1, C, H', W')
 ) -> _Matches:

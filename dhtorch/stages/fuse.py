@@ -1,7 +1,5 @@
 """Fusion of source views: estimates (V, B, N) of one reference view's samples → one estimate (B, N)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

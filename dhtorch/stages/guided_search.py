@@ -8,8 +8,6 @@ infinity to the near limit. The segment is searched on a small image, and the be
 finely on larger images. A match is *unique* if every other place of the segment fits clearly worse.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -5,8 +5,6 @@ A sample without a usable return has exactly one class (``codes.Hole``), and eac
 the missing return.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

@@ -8,8 +8,6 @@ Alphabet: ``p`` the inverse depth of a return and ``q`` that of its track triang
 d(pixel of view 1) / dq along the epipolar line (px m), so that (q − p) a is the residual along that line in px.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

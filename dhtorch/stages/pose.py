@@ -1,7 +1,5 @@
 """Stage 5: near returns and tracks → metric relative pose of the pair with a covariance, or a code without pose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ covariance, the sensor's noise and the track's; ``xi`` the tangent from the give
 near returns.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

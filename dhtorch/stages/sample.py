@@ -3,8 +3,6 @@
 Every sampler returns exactly ``n`` pixels inside the image, in a fixed order, without reading the image.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any

@@ -4,8 +4,6 @@ Three closed-form scores and a learned one. Alphabet of the latter: ``x`` (…, 
 ``e`` its expected relative error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self

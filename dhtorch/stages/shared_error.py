@@ -8,8 +8,6 @@ independent poses that give the same points different depths, and views without 
 Alphabet: ``ratio`` the parallax of a point over the angle of rotation between the views, without unit.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

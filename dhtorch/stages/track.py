@@ -4,8 +4,6 @@ The search is in :mod:`dhtorch.geometry.lucas_kanade`, whose alphabet is used he
 ``x`` (2, M) in image 0 and ``d`` their displacement to image 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

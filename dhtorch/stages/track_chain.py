@@ -8,8 +8,6 @@ not. But its template is the window of the image before, and the errors of the h
 window of image 0 is searched once more, from where the chain is: the error is then that of a single track.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Stage 6: two views' tracks and pose → depth with a sigma, or a gate code where the geometry is weak."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

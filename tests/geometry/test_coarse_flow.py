@@ -1,7 +1,5 @@
 """Where to look first: coarse motion of whole images, against motions that are known."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Work without a graph: the same numbers, and tensors that may enter a graph afterwards."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Poses from elsewhere on real captures: true ones are used, wrong ones refuted and called by their name."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

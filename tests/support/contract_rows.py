@@ -4,8 +4,6 @@ A :class:`Row` makes the inputs of a function and lists the promises that hold; 
 test for every promise. Leaves are the tensors of records, tuples and dicts, in order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

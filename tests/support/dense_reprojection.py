@@ -5,8 +5,6 @@ translation, turn), ``s`` (2,) to its inverse depth, ``r`` (2,) px, ``W`` the in
 the variance of the inverse depth. Everything is numpy, float64, of one pair.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

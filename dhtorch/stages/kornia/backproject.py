@@ -1,7 +1,5 @@
 """Stage 2 on kornia: depth maps and sample pixels → metric points, sigma, confidence and flags."""
 
-from __future__ import annotations
-
 import kornia.geometry as kg
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Stage 3 on kornia: samples → samples with trackability and a hole class, the cause of a missing return."""
 
-from __future__ import annotations
-
 from kornia.feature import gftt_response
 from kornia.geometry.transform import remap
 

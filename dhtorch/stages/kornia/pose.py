@@ -4,8 +4,6 @@ The minimal solver is :func:`dhtorch.geometry.p3p.p3p`, the one function that ko
 six points and raises for the whole batch where those of one element lie in a plane.
 """
 
-from __future__ import annotations
-
 import kornia.geometry as kg
 import torch
 import torch.nn.functional as F

@@ -4,8 +4,6 @@ Alphabet: ``T`` (B, N, P) grey values of image 0 in the P pixels around each poi
 their gradient, ``J`` (B, N, P) those of image 1 around ``y`` (B, N, 2); A = Σ g gᵀ. The track y makes Σ g (J − T) zero.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.filters import spatial_gradient
 from kornia.geometry.transform import build_pyramid, remap

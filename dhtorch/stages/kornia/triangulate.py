@@ -1,7 +1,5 @@
 """Stage 6 on kornia: two views' tracks and pose → depth with a sigma, or a gate where the geometry is weak."""
 
-from __future__ import annotations
-
 import kornia.geometry as kg
 import torch
 from torch import Tensor
