@@ -23,8 +23,8 @@ from dhtorch.data.recording import Recording
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.integrate import DepthView, extract_mesh, extract_points, fuse_views, make_volume
 from dhtorch.measure import metric_scale
-from dhtorch.metrics import errors, reliability, risk
-from dhtorch.metrics.calibration.fitting import fit_calibration
+from dhtorch.metrics import bootstrap, control, curves, errors, holdout, monotone, reliability, risk
+from dhtorch.metrics.calibration.fitting import fit_calibration, fit_sigma_model
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER
 from dhtorch.pytree import collate, stack
@@ -71,6 +71,8 @@ def answer(name):
 def pair(name):
     estimate, trace = answer(name)
     kept = {key: trace[key] for key in ("samples", "tracks", "fit") if key in trace}
+    if "dense" in trace:
+        kept["dense"] = trace["dense"].replace(parts=None)
     return {"estimate": estimate, **kept}
 
 
@@ -132,6 +134,71 @@ def metrics_of_points():
     }
 
 
+def joined(rows):
+    """The digests of many results as one list of numbers a row."""
+    leaves = {name: digests.digest(row).values() for name, row in rows.items()}
+    return {name: [x for leaf in of for x in leaf[1:] if not isinstance(leaf, str)] for name, of in leaves.items()}
+
+
+def metrics_of_scenes():
+    """Scenes of different sizes, half of them with tied scores, most with scores that mean something."""
+    sizes = (30, 80, 12, 200, 45, 60, 90, 25, 70, 50)
+    drawn = [random_points(n, seed, ties=seed % 2 == 1) for seed, n in enumerate(sizes)]
+    scenes = [p.replace(score=(p.score - p.error.nan_to_num()).mul(6).round() / 6) for p in drawn[:8]] + drawn[8:]
+    claimed, good, weight = reliability.pool_answers(scenes)
+    controls = [
+        (control.plug_in_threshold, {}),
+        *((control.conformal_threshold, {"confidence": c}) for c in (None, 0.5)),
+    ]
+    controls += [(control.scene_quantile_threshold, x) for x in ({}, {"share": 0.6}, {"few": 12}, {"share": 0.95})]
+    found = {
+        "risk": [risk.measure_risk(p) for p in scenes],
+        "sparsification": [risk.ause(p) for p in scenes],
+        "curves": [curves.sample_curves(p) for p in scenes],
+        "controls": [choose(scenes, at, **more) for choose, more in controls for at in (0.12, 0.25)],
+        "intervals": [
+            bootstrap.interval_over_scenes([0.3, 1.2, 2.9, 0.1, 1.7], statistic=name, level=0.8, draws=300, seed=4)
+            for name in ("median", "mean", "geometric_mean")
+        ],
+        "ece": [reliability.ece_interval(scenes, draws=50), reliability.ece_interval(scenes, bins=3, draws=50, seed=9)],
+        "diagrams": [
+            reliability.reliability_diagram(1.4 * claimed - 0.2, good, w, bins=bins, equal_mass=equal)
+            for w in (None, weight)
+            for bins in (1, 7)
+            for equal in (False, True)
+        ],
+        "isotonic": [
+            monotone.fit_isotonic(claimed, good.double(), weight, rising=rising, **more)
+            for rising in (True, False)
+            for more in ({}, {"min_share": 0.15}, {"min_share": 0.3, "ends": (-2.0, 2.0)})
+        ],
+        "calibration": fit_calibration(scenes, min_share=0.2, targets=(30,)),
+        "sigma": [fit_sigma_model([p.replace(sigma=k * p.sigma) for p in scenes]) for k in (0.3, 3.0)],
+    }
+    return joined(found)
+
+
+def held_out():
+    """The truth test and the cohort of real holes on a map with steps and empty places, dense and sparse."""
+    g = torch.Generator().manual_seed(7)
+    empty, spread, place, chosen = torch.rand(4, 1, 60, 80, generator=g, dtype=torch.float64)
+    depth = (2 + torch.linspace(0, 2.4, 80) ** 2 / 4) * (1 + 0.02 * spread)
+    depth[..., 27:] *= 1.2  # a step that the wide window alone takes for smooth
+    depth = torch.where(empty > 0.995, torch.inf, torch.where(empty < 0.01, 0.0, depth))
+    uv = torch.stack((170 * place.flatten(1) - 5, 130 * chosen.flatten(1) - 5), -1)[:, :600]
+    samples = PAPER.replace(n=600).sample_depth(frame(1)).replace(uv=uv)
+    views = {"dense": (1.0, None), "sparse": (0.1, torch.tensor([True]))}
+    views = {k: frame(1).replace(depth=depth.where(spread < n, 0.0), sparse=x) for k, (n, x) in views.items()}
+    found = {
+        f"{k} {rule}": holdout.sample_truth(v, uv, truth=rule, window=13)
+        for k, v in views.items()
+        for rule in ("raw", "5x5", "full")
+    }
+    changes = ({}, {"window": 5}, {"min_returns": 1}, {"agreement": 0.02}, {"min_texture": 0.9})
+    truth = found["dense full"]
+    return found | {"holes": [holdout.select_real_holes(views["sparse"], samples, truth, **more) for more in changes]}
+
+
 def measured():
     """The metric size of a model of the room."""
     model, _ = room_model("maps", "bend", 0.02)
@@ -171,6 +238,8 @@ PROBLEMS = {
     "check a capture": checked,
     "map": mapped,
     "metrics": metrics_of_points,
+    "metrics of scenes": metrics_of_scenes,
+    "held-out truth": held_out,
     "coarse flow": flow,
     "scale of a model": measured,
     "pinned camera": pinned,

@@ -1,4 +1,4 @@
-"""Calibrations of scores and sigmas: fitted against plain loops, applied, and stored as JSON."""
+"""Calibrations of scores and sigmas: applied, and stored as JSON; fitted numbers: test_stored_answers.py."""
 
 import dataclasses
 import json
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.metrics import calibration, control, errors, monotone, reliability
+from dhtorch.metrics import calibration, errors, monotone, reliability
 from dhtorch.metrics.calibration import fitting
 
 
@@ -28,78 +28,7 @@ def fitted(**provenance):
     return fitting.fit_calibration([scene_of(800, s) for s in range(3)], provenance=note)
 
 
-def loop_quantile(x, weight, share):
-    """The smallest value below or at which that share of the weight lies."""
-    below, total = 0.0, sum(weight)
-    for value, w in sorted(zip(x, weight, strict=True)):
-        below += w
-        if below >= share * total - 1e-12:
-            return value
-    return max(x)
-
-
-def loop_sigma(scenes):
-    """Scale and floor: the likeliest under Student's t of those that hold 68 %, widened until 91 % lie within two."""
-    t = pytest.importorskip("scipy.stats").t(3)
-    error, sigma, weight = [], [], []
-    for p in scenes:
-        rows = zip(p.depth.tolist(), p.true_depth.tolist(), p.sigma.tolist(), p.keep.tolist(), strict=True)
-        rows = [(abs(z - true) / z, s / z) for z, true, s, k in rows if k and math.isfinite(s) and s > 0]
-        error, sigma = error + [e for e, _ in rows], sigma + [s for _, s in rows]
-        weight += [1 / len(rows)] * len(rows)
-    best = None
-    for floor in (0.0, *(10 ** (-4 + k / 10) for k in range(31))):
-        ratio = [(e * e - floor * floor) / (s * s) for e, s in zip(error, sigma, strict=True)]
-        scale = math.sqrt(max(0.0, loop_quantile(ratio, weight, 0.6826894921370859)))
-        spread = np.maximum([math.hypot(scale * s, floor) for s in sigma], 1e-300)
-        likely = float((np.array(weight) * (t.logpdf(np.array(error) / spread) - np.log(spread))).sum())
-        best = (likely, scale, floor, spread) if best is None or likely > best[0] else best
-    _, scale, floor, spread = best
-    wider = max(1.0, loop_quantile((np.array(error) / spread).tolist(), weight, 0.91) / 2)
-    return scale * wider, floor * wider, wider
-
-
-@pytest.mark.parametrize(("spread", "floor", "gross"), [(0.5, 0.0, 0), (2.0, 0.05, 0), (1.0, 0.02, 7), (0.3, 0.2, 9)])
-def test_the_correction_of_sigma_equals_plain_loops(spread, floor, gross):
-    scenes = [scene_of(n, seed, spread=spread, floor=floor) for seed, n in enumerate((30, 80, 45))]
-    scenes[0].sigma[:5], scenes[1].sigma[3] = 0.0, math.inf
-    for scene in scenes:
-        scene.depth[5 : 5 + gross] *= 3  # gross errors, more than one in ten
-    found = fitting.fit_sigma_model(scenes)
-    scale, floor, wider = loop_sigma(scenes)
-    assert (found.scale, found.floor) == pytest.approx((scale, floor), rel=1e-6) and (wider > 1) is (gross > 0)
-
-
-SCENES = [scene_of(n, s) for s, n in enumerate((90, 40, 60))]
 SILENT = errors.make_points(torch.full((4,), math.nan), torch.ones(4))
-WIDE = SCENES[2].replace(score=torch.where(SCENES[2].keep, 3 * SCENES[2].score - 1, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("scenes", "options", "share", "ends", "targets"),
-    [
-        ([*SCENES, SILENT], {}, 0.02, (0.0, 1.0), (5, 10, 20)),
-        (SCENES, {"min_share": 0.2}, 0.2, (0.0, 1.0), (5, 10, 20)),
-        (SCENES, {"targets": (30,)}, 0.02, (0.0, 1.0), (30,)),
-        ([WIDE], {}, 0.02, (float(WIDE.answered().score.min()), float(WIDE.answered().score.max())), (5, 10, 20)),
-        ([SCENES[0].replace(sigma=SCENES[0].sigma * math.nan)], {}, 0.02, (0.0, 1.0), (5, 10, 20)),
-    ],
-)
-def test_a_calibration_is_made_of_its_parts(scenes, options, share, ends, targets):
-    found = fitting.fit_calibration(scenes, provenance={"method": "x"}, **options)
-    score, good, weight = reliability.pool_answers(scenes)
-    loss = torch.cat([s.answered().error.clamp(max=1) for s in scenes])
-    steps = {"min_share": share, "ends": ends}
-    for table, expected in (
-        (found.probability, monotone.fit_isotonic(score, good.double(), weight, **steps)),
-        (found.expected_error, monotone.fit_isotonic(score, loss, weight, rising=False, **steps)),
-    ):
-        assert torch.equal(table.x, expected.x) and torch.equal(table.y, expected.y)
-    assert torch.equal(found.sigmoid.slope, monotone.fit_platt(score, good, weight).slope)
-    assert found.sigma == fitting.fit_sigma_model(scenes)
-    assert found.thresholds == {k: control.plug_in_threshold(scenes, k / 100).threshold for k in targets}
-    n_scenes = sum(bool(s.keep.any()) for s in scenes)
-    assert found.provenance == {"method": "x", "n_scenes": n_scenes, "n_answers": score.numel()}
 
 
 def test_a_calibration_is_applied_to_score_and_sigma():

@@ -1,41 +1,16 @@
-"""Numbers from estimates and truth: against numpy, scipy and plain loops."""
+"""Numbers from estimates and truth: by hand and against scipy; many numbers at once: test_stored_answers.py."""
 
 import math
-import statistics
 
 import numpy as np
 import pytest
 import torch
-from support.random_answers import random_points
 
-from dhtorch.metrics import bootstrap, correlation, curves, errors, holdout, reliability, risk
+from dhtorch.metrics import bootstrap, correlation, curves, errors, holdout
 from dhtorch.metrics.holdout import TruthCode
 from dhtorch.records import Estimate
 
 NAN = math.nan
-
-
-def test_errors_equal_numpy():
-    p = random_points(500)
-    keep = p.keep.numpy()
-    z, true, sigma, residual = (x.numpy()[keep] for x in (p.depth, p.true_depth, p.sigma, p.residual_px))
-    rel = np.abs(z - true) / true
-    expected = {
-        "n_candidates": 500,
-        "n_kept": keep.sum(),
-        "coverage": keep.mean(),
-        "median_rel": np.median(rel),
-        "p90_rel": np.percentile(rel, 90),
-        "wrong_share": (rel > 0.2).mean(),
-        "corr": np.corrcoef(z, true)[0, 1],
-        "residual_px": np.median(residual),
-        "within_sigma": (np.abs(z - true) <= sigma).mean(),
-        "within_2sigma": (np.abs(z - true) <= 2 * sigma).mean(),
-    }
-    found = errors.measure_errors(p)
-    assert found.keys() == expected.keys()
-    for name, value in expected.items():
-        assert found[name] == pytest.approx(value, abs=1e-12), name
 
 
 def points(depth, true, **columns):
@@ -131,31 +106,6 @@ def test_a_summary_is_over_scenes_and_flattens_groups():
 # ---------------------------------------------------------------------------------------------------- bootstrap
 
 
-def plain_interval(values, join, level, draws, seed):
-    """Every resample of the scenes for itself, then the percentiles that enclose ``level``."""
-    rows = bootstrap.resample_scenes(len(values), draws, seed=seed).tolist()
-    found = [join([values[i] for i in row]) for row in rows]
-    return join(values), *np.percentile(found, [50 * (1 - level), 50 * (1 + level)])
-
-
-@pytest.mark.parametrize("n", [2, 5, 8])
-@pytest.mark.parametrize(
-    ("statistic", "join"),
-    [("median", np.median), ("mean", np.mean), ("geometric_mean", statistics.geometric_mean)],
-)
-def test_an_interval_equals_percentiles_of_resampled_scenes(n, statistic, join):
-    values = np.random.default_rng(n).uniform(0.1, 3, n).tolist()
-    options = {"statistic": statistic, "level": 0.8, "draws": 300, "seed": 4}
-    found = bootstrap.interval_over_scenes([None, *values, -math.inf, NAN], **options)
-    assert found[:3] == pytest.approx(plain_interval(values, join, 0.8, 300, 4), rel=1e-9) and found.n == n
-    default = plain_interval(values, np.median, 0.95, 2000, 0)
-    assert bootstrap.interval_over_scenes(values)[:3] == pytest.approx(default, rel=1e-9)
-    spread = bootstrap.interval_of_statistic(
-        lambda index: torch.tensor(values)[index].amax(-1) - torch.tensor(values)[index].mean(-1), n
-    )
-    assert spread[:3] == pytest.approx(plain_interval(values, lambda x: max(x) - sum(x) / n, 0.95, 2000, 0), rel=1e-5)
-
-
 def test_scenes_are_drawn_with_replacement_each_as_often_as_another():
     index = bootstrap.resample_scenes(7, 20000, seed=2)
     assert index.shape == (20000, 7) and index.min() == 0 and index.max() == 6
@@ -219,45 +169,6 @@ def test_a_correlation_needs_two_values_that_differ(correlate, x, y, expected):
 
 
 # ---------------------------------------------------------------------------------------------------- curves
-
-
-def five(x):
-    return None if x is None or math.isnan(x) else float(f"{x:.5g}")
-
-
-@pytest.mark.parametrize("n", [1, 7, 33, 90])
-@pytest.mark.parametrize("ties", [False, True])
-def test_curves_equal_plain_loops(n, ties):
-    p = random_points(n, seed=n, ties=ties, unanswered=0.0 if n == 1 else 0.3)
-    found, a = curves.sample_curves(p), p.answered()
-    kept = a.keep.numel()
-    ranked = sorted(zip(a.score.tolist(), a.error.tolist(), strict=True), key=lambda row: -row[0])
-    at = sorted({max(1, round(kept * k / 20)) for k in range(1, 21)})
-    curve, oracle = risk.risk_coverage(p)[1].tolist(), np.minimum(sorted(a.error.tolist()), 1)
-    tenths = np.array_split(np.argsort(p.true_depth.numpy(), kind="stable"), min(10, n))
-    error, keep, true = p.error.numpy(), p.keep.numpy(), p.true_depth.numpy()
-    table = reliability.reliability_diagram(a.score, a.error < 0.1, bins=10)
-    expected = {
-        "risk_coverage": {
-            "coverage": [k / n for k in at],
-            "risk": [curve[k - 1] for k in at],
-            "oracle": [oracle[:k].mean() for k in at],
-            "score": [ranked[k - 1][0] for k in at],
-            "median_rel": [np.median([e for _, e in ranked[:k]]) for k in at],
-        },
-        "distance": {
-            "depth": [np.median(true[k]) for k in tenths],
-            "coverage": [keep[k].mean() for k in tenths],
-            "median_rel": [np.median(error[k][keep[k]]) if keep[k].any() else None for k in tenths],
-        },
-        "reliability": {name: getattr(table, name).tolist() for name in ("claimed", "realised", "weight")},
-    }
-    assert {k: list(v) for k, v in found.items()} == {k: list(v) for k, v in expected.items()}
-    for part, columns in expected.items():
-        for name, values in columns.items():
-            rounded = [five(v) for v in found[part][name]]
-            assert found[part][name] == rounded
-            np.testing.assert_allclose(*(np.array(v, dtype=float) for v in (rounded, values)), 5.1e-5, err_msg=name)
 
 
 def test_curves_of_nothing_are_empty():

@@ -16,11 +16,6 @@ def test_sigma_of_normal_numbers_and_a_mean_that_outliers_do_not_move():
     assert abs(huber_mean(spoilt, np.ones(2201))) < 0.25 < abs(spoilt.mean()) and np.isnan(huber_mean(x[:0], x[:0]))
 
 
-def test_sigma_of_a_mean_falls_with_the_root_of_the_number_of_frames():
-    mean, sigma = mean_over_stretches(np.full(25, 2.0), np.full(25, 0.1))
-    assert mean == pytest.approx(2.0) and sigma == pytest.approx(0.1 / 5)
-
-
 def test_sigma_of_a_mean_covers_errors_that_last_over_a_stretch():
     draw = np.random.default_rng(0)
     within = []

@@ -1,21 +1,15 @@
-"""The range split and the truth test: on maps whose answer is known by hand, and against plain loops."""
+"""The range split and the truth test: on maps whose answer is known by hand; many numbers at once: test_stored_answers.py."""
 
 import math
-import os
-import statistics
-from pathlib import Path
 
 import pytest
 import torch
 
-from dhtorch import data
 from dhtorch.codes import Flag
 from dhtorch.metrics import holdout
 from dhtorch.metrics.holdout import TruthCode
 from dhtorch.records import Camera, Frame, Samples
 
-ROOT = os.environ.get("DHTORCH_DATA")
-RULES = {"raw": 2, "5x5": 3, "full": 4}  # truth test -> codes that it distinguishes
 OK, NONE, NEAR, CLOSE, WIDE = (getattr(TruthCode, n) for n in ("CANDIDATE", "NO_RETURN", "NEAR", "CLOSE", "WIDE"))
 EXCLUDED, TEXTURE, HOLE = TruthCode.EXCLUDED, TruthCode.TEXTURE, TruthCode.REAL_HOLE
 
@@ -57,64 +51,6 @@ def test_range_split_removes_what_lies_beyond_and_nothing_else(cutoff, expected)
 
 
 # ---------------------------------------------------------------------------------------------------- truth test
-
-
-def plain_truth(depth, uv, truth, sparse, scale=1.0, window=25):
-    """The truth test of one map (h, w), one sample and one pixel at a time."""
-    (h, w), depth = depth.shape, depth.tolist()
-
-    def around(u, v, size):
-        """Returns of the window, with the squared distance of each; how many pixels have none."""
-        side = max(3, int(size * scale / 2) * 2 + 1)
-        found, empty = [], 0
-        for y in range(v - side // 2, v + side // 2 + 1):
-            for x in range(u - side // 2, u + side // 2 + 1):
-                z = depth[y][x] if 0 <= x < w and 0 <= y < h else 0.0
-                if math.isfinite(z) and z > 0:
-                    found.append(((x - place[0]) ** 2 + (y - place[1]) ** 2, z))
-                else:
-                    empty += 1
-        return found, empty
-
-    spread = lambda found: max(z for _, z in found) / min(z for _, z in found) - 1 if found else 0.0  # noqa: E731
-    rows = []
-    for u, v in uv.tolist():
-        place = (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5
-        at = [math.floor(x + 0.5) for x in place]
-        close, empty = around(*at, 7 if sparse else 5)
-        wide, _ = around(*at, 15 if sparse else window)
-        z = min(close)[1] if sparse and close else 0.0
-        if not sparse and 0 <= at[0] < w and 0 <= at[1] < h:
-            z = depth[at[1]][at[0]]
-            z = z if math.isfinite(z) and z > 0 else 0.0
-        code = OK
-        if z == 0:
-            code = NONE
-        elif truth != "raw" and (spread(close) >= 0.05 or (empty and not sparse)):
-            code = CLOSE
-        elif truth == "full" and spread(wide) >= 0.15:
-            code = WIDE
-        rows.append((z, code))
-    return rows
-
-
-@pytest.mark.parametrize("truth", RULES)
-@pytest.mark.parametrize(("sparse", "scale"), [(False, 1.0), (False, 0.5), (True, 1.0), (True, 2.0)])
-def test_the_truth_test_equals_plain_loops(truth, sparse, scale):
-    g = torch.Generator().manual_seed(7)
-    h, w = (round(n * scale) for n in (40, 60))
-    ramp = 4 + torch.linspace(0, 2.4, w) ** 2 / 2
-    depth = (ramp * (1 + 0.02 * torch.rand(h, w, generator=g))).double()
-    empty = torch.rand(h, w, generator=g)
-    depth[empty < (0.93 if sparse else 0.01)] = 0
-    depth[empty > 0.992], depth[empty > 0.995], depth[empty > 0.998] = math.nan, math.inf, -1.0
-    depth[:, w // 3 :] *= 1.08  # a step that the wide window alone takes for smooth
-    uv = torch.rand(150, 2, generator=g, dtype=torch.float64) * torch.tensor([66.0, 46.0]) - 3
-    found = holdout.sample_truth(frame_of(depth, hw=(40, 60), sparse=sparse), uv[None], truth=truth, window=13)
-    expected = plain_truth(depth, uv, truth, sparse, scale, window=13)
-    assert found.depth[0].tolist() == [z for z, _ in expected]
-    assert found.code[0].tolist() == [code for _, code in expected]
-    assert len(set(found.code[0].tolist())) == RULES[truth], "every rule of the test rejects some"
 
 
 def test_each_map_of_a_batch_is_sparse_or_dense_for_itself():
@@ -182,26 +118,6 @@ OWN = Camera(torch.tensor([[25.0, 25.0]]), torch.tensor([[10.0, 14.0]]))
 def test_truth_at_edges_and_through_other_cameras(frame, uv, options, depth, code):
     found = holdout.sample_truth(frame, uv, **options)
     assert (found.depth[0].tolist(), found.code[0].tolist()) == (depth, code)
-
-
-@pytest.mark.data
-@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
-@pytest.mark.parametrize(("name", "cutoff"), [("holo_a", 2.5), ("7s_redkitchen_600", 2.0), ("dgp_drive6cam", 20.0)])
-def test_every_held_back_return_of_a_real_frame_is_accounted_for(name, cutoff):
-    frame = data.open_all(Path(ROOT) / name)[0][0]
-    v, u = torch.meshgrid(torch.arange(4, frame.hw[0], 11.0), torch.arange(4, frame.hw[1], 11.0), indexing="ij")
-    uv = torch.stack((u, v), -1).flatten(0, 1)[None]
-    textured = samples_of(torch.rand(1, uv.shape[1], generator=torch.Generator().manual_seed(0)))
-    kept = []
-    for rule in RULES:
-        truth = holdout.sample_truth(frame, uv, truth=rule)
-        found = holdout.select_candidates(textured, truth, cutoff)
-        assert int(found.ok.sum()) + sum(found.dropped().values()) == int((truth.depth > cutoff).sum())
-        kept.append(found.ok)
-    assert (kept[0] >= kept[1]).all() and (kept[1] >= kept[2]).all()
-    assert kept[0].sum() > kept[2].sum() > 0.2 * kept[0].sum()
-    near = holdout.range_split(frame, cutoff)
-    assert near.depth.max() <= cutoff and torch.equal(near.depth > 0, (frame.depth > 0) & (frame.depth <= cutoff))
 
 
 # ---------------------------------------------------------------------------------------------------- candidates
@@ -296,70 +212,7 @@ def test_a_split_assigns_every_usable_trackable_sample_to_one_of_two_sets(option
     assert torch.equal(*holdout.split_half(clean, 3, **options)[0]), "by the index alone"
 
 
-@pytest.mark.parametrize(("options", "limit"), [({}, 1e-5), ({"min_trackability": 0.3}, 0.3)])
-def test_a_sample_at_the_least_trackability_is_in_a_half(options, limit):
-    a, b = holdout.split_half(samples_of([[limit, 0.999 * limit]]), 0, **options)
-    assert (a | b).tolist() == [[True, False]]
-
-
-def test_hidden_returns_are_those_of_a_silent_sensor_and_the_others_stay():
-    samples = whole_samples(40)
-    hidden = torch.arange(40)[None] % 3 == 0
-    found = holdout.hide_returns(samples, hidden)
-    silent = {"depth": 0.0, "sigma": 0.0, "confidence": 0.0, "flag": samples.flag | Flag.NO_DEPTH}
-    for name in ("uv", "trackability", "hole", *silent):
-        old = getattr(samples, name)
-        assert torch.equal(getattr(found, name), torch.where(hidden, silent[name], old) if name in silent else old), (
-            name
-        )
-    expected = torch.where(hidden[..., None], torch.nan, samples.xyz)
-    torch.testing.assert_close(found.xyz, expected, equal_nan=True, rtol=0, atol=0)
-
-
 # ---------------------------------------------------------------------------------------------------- real holes
-
-
-def plain_holes(depth, samples, truth, window=7, min_returns=3, agreement=0.1, min_texture=0.2):
-    """The cohort of real holes in one map as wide as the image, one sample at a time."""
-    (h, w), depth = depth.shape, depth.tolist()
-    codes, texture = [], min_texture * statistics.median(samples.trackability[0].tolist())
-    for k, (u, v) in enumerate(samples.uv[0].tolist()):
-        x, y = math.floor(u + 0.5), math.floor(v + 0.5)
-        near = [
-            depth[j][i]
-            for j in range(y - window // 2, y + window // 2 + 1)
-            for i in range(x - window // 2, x + window // 2 + 1)
-            if 0 <= i < w and 0 <= j < h and depth[j][i] > 0
-        ]
-        true, code = float(truth.depth[0, k]), int(truth.code[0, k])
-        inside = 0 <= x < w and 0 <= y < h
-        disagrees = len(near) < min_returns or abs(statistics.median_low(near) - true) > agreement * true
-        rules = [
-            (NONE, code == NONE),
-            (NEAR, inside and depth[y][x] > 0),
-            (code, code in (CLOSE, WIDE)),
-            (EXCLUDED, disagrees),
-            (TEXTURE, samples.trackability[0, k] < texture),
-            (OK, True),
-        ]
-        codes.append(next(rule for rule, holds in rules if holds))
-    return codes
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"window": 5}, {"min_returns": 9}, {"agreement": 0.02}, {"min_texture": 0.9}, {"min_returns": 1}]
-)
-def test_real_holes_equal_plain_loops(options):
-    g = torch.Generator().manual_seed(1)
-    draw = lambda *size: torch.rand(*size, generator=g, dtype=torch.float64)  # noqa: E731
-    depth = 2 + draw(30, 40)
-    depth[draw(30, 40) < 0.85] = 0
-    samples = samples_of(draw(1, 300), uv=draw(1, 300, 2) * torch.tensor([42.0, 32.0]) - 1)
-    code = torch.tensor([0, 0, 0, 0, 0, 0, 1, 3, 4], dtype=torch.int32)[torch.randint(0, 9, (1, 300), generator=g)]
-    truth = holdout.Truth(2 + draw(1, 300), code)
-    found = holdout.select_real_holes(frame_of(depth), samples, truth, **options)
-    assert found.code[0].tolist() == plain_holes(depth, samples, truth, **options)
-    assert torch.equal(found.depth, truth.depth) and int(found.ok.sum()) > 5
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,4 @@
-"""Monotone functions: against scikit-learn, numpy, scipy and plain loops."""
-
-import itertools
+"""Monotone functions: by hand, against numpy and scipy; many numbers at once: test_stored_answers.py."""
 
 import numpy as np
 import pytest
@@ -11,56 +9,6 @@ from dhtorch.metrics import monotone
 
 def uniform(*shape, seed=0):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def plain_isotonic(x, y, weight, rising, min_share, ends):
-    """Corners of the table: the blocks, joined while they are light, their middles, the tilted ends."""
-    regression = pytest.importorskip("sklearn.isotonic").isotonic_regression
-    at = sorted({a for a, w in zip(x, weight, strict=True) if w})
-    mass = [sum(w for a, w in zip(x, weight, strict=True) if a == b) for b in at]
-    rows = list(zip(x, y, weight, strict=True))
-    mean = [sum(w * v for a, v, w in rows if a == b) / m for b, m in zip(at, mass, strict=True)]
-    fitted = regression(mean, sample_weight=mass, increasing=rising)
-    blocks = []  # weight, weight · x, weight · y
-    for key, group in itertools.groupby(range(len(at)), key=lambda k: round(fitted[k], 12)):
-        members = list(group)
-        heavy = sum(mass[k] for k in members)
-        block = [heavy, sum(mass[k] * at[k] for k in members), heavy * key]
-        light = blocks and blocks[-1][0] < min_share * sum(mass)
-        blocks.append([a + b for a, b in zip(blocks.pop(), block, strict=True)] if light else block)
-    if len(blocks) > 1 and blocks[-1][0] < min_share * sum(mass):
-        last = blocks.pop()
-        blocks[-1] = [a + b for a, b in zip(blocks[-1], last, strict=True)]
-    middle, value = [b[1] / b[0] for b in blocks], [b[2] / b[0] for b in blocks]
-    low, high = ends or (at[0], at[-1])
-    if len(blocks) == 1:
-        return middle, value
-    tilt = lambda step: max(-1e-3, min(1e-3, step / 4))  # noqa: E731
-    xs, ys = list(middle), list(value)
-    if low < middle[0]:
-        xs, ys = [low, *xs], [value[0], value[0] + tilt(value[1] - value[0]), *ys[1:]]
-    if high > middle[-1]:
-        xs, ys = [*xs, high], [*ys[:-1], value[-1] - tilt(value[-1] - value[-2]), value[-1]]
-    return xs, ys
-
-
-@pytest.mark.parametrize("rising", [True, False])
-@pytest.mark.parametrize(
-    "options", [{}, {"min_share": 0.15}, {"ends": (-1.0, 2.0)}, {"min_share": 0.3, "ends": (0.0, 1.0)}]
-)
-@pytest.mark.parametrize("n", [1, 4, 25, 80])
-def test_a_table_runs_straight_from_the_middle_of_a_block_to_the_next(n, options, rising):
-    g = np.random.default_rng(n)
-    x = g.integers(1, 20, n) / 20
-    y = np.where(g.uniform(size=n) < x, 1.0, 0.0) if n == 80 else x + g.normal(0, 0.2, n)
-    y, weight = y if rising else -y, g.integers(0, 4, n) / 2
-    weight[0] = 1.0
-    found = monotone.fit_isotonic(*map(torch.from_numpy, (x, y, weight)), rising=rising, **options)
-    options = {"min_share": 0.0, "ends": None, **options}
-    xs, ys = plain_isotonic(x.tolist(), y.tolist(), weight.tolist(), rising, **options)
-    assert found.x.tolist() == pytest.approx(xs, abs=1e-9) and found.y.tolist() == pytest.approx(ys, abs=1e-9)
-    values = found(torch.linspace(*(options["ends"] or (0, 1)), 999, dtype=torch.float64)).diff()
-    assert ((values if rising else -values) >= 0).all()
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
-"""Risk and coverage of a score: against plain loops, with ties and at the limits."""
+"""Risk and coverage of a score: with ties and at the limits; many numbers at once: test_stored_answers.py."""
 
-import itertools
 import math
-import statistics
 
 import pytest
 import torch
@@ -17,70 +15,6 @@ def with_errors(error, score=None):
     p = errors.make_points(torch.ones(len(error)), torch.ones(len(error)), score)
     true = torch.where(torch.tensor(error) > 0, 1 / torch.tensor(error, dtype=torch.float64), 1.0).round()
     return p.replace(true_depth=true, depth=true + (torch.tensor(error) > 0))
-
-
-def plain_curve(loss, score):
-    """Expected running mean over all orders of tied scores, one k at a time."""
-    risks = []
-    for k in range(1, len(loss) + 1):
-        threshold = sorted(score, reverse=True)[k - 1]
-        sure = [e for e, s in zip(loss, score, strict=True) if s > threshold]
-        tied = [e for e, s in zip(loss, score, strict=True) if s == threshold]
-        risks.append((sum(sure) + (k - len(sure)) * sum(tied) / len(tied)) / k)
-    return risks
-
-
-def plain_measure(p, min_points=10):
-    error, score, keep = p.error.tolist(), p.score.tolist(), p.keep.tolist()
-    loss = [min(e, 1.0) for e, k in zip(error, keep, strict=True) if k]
-    sure = [s for s, k in zip(score, keep, strict=True) if k]
-    risks, oracle = plain_curve(loss, sure), plain_curve(loss, [-e for e in loss])
-    everything = [min(e, 1.0) if k else 1.0 for e, k in zip(error, keep, strict=True)]
-    full = plain_curve(everything, [s if k else -9.0 for s, k in zip(score, keep, strict=True)])
-    numbers = {
-        "aurc": statistics.mean(risks),
-        "aurc_excess": statistics.mean(risks) - statistics.mean(oracle),
-        "aurc_full": statistics.mean(full),
-        "augrc": statistics.mean(r * (k + 1) / len(risks) for k, r in enumerate(risks)),
-        "monotonicity": None,
-        "largest_fall": None,
-    }
-    for percent in (5, 10, 20):
-        best = 0
-        for threshold in set(sure):
-            accepted = [e for e, s in zip(loss, sure, strict=True) if s >= threshold]
-            if len(accepted) >= min_points and sum(accepted) / len(accepted) <= percent / 100:
-                best = max(best, len(accepted))
-        numbers[f"coverage_at_{percent}"] = best / len(error)
-    if len(risks) >= 10:
-        tenths = [risks[len(risks) * k // 10 - 1] for k in range(1, 11)]
-        numbers["monotonicity"] = sum(b >= a - 1e-12 for a, b in itertools.pairwise(tenths)) / 9
-        numbers["largest_fall"] = max(a - b for k, a in enumerate(tenths) for b in tenths[k:])
-    return numbers
-
-
-@pytest.mark.parametrize("ties", [False, True])
-@pytest.mark.parametrize("n", [1, 2, 9, 23, 40, 150])
-def test_risk_equals_plain_loops_in_any_order_of_the_list(n, ties):
-    for seed in range(4):
-        p = random_points(n, seed, ties, unanswered=0.0 if n == 1 else 0.3)
-        if not p.keep.any():
-            continue
-        # a score that means something, so that the coverages are not all zero
-        better = (p.score - p.error.nan_to_num()).mul(4).round() if ties else p.score - 3 * p.error.nan_to_num()
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(3))
-        for scored in (p, p.replace(score=better), p.replace(score=-p.error), p.replace(score=p.error)):
-            expected = plain_measure(scored)
-            for found in (risk.measure_risk(scored), risk.measure_risk(scored[order])):
-                assert found.keys() == expected.keys()
-                for name, value in expected.items():
-                    assert found[name] == (None if value is None else pytest.approx(value, abs=1e-12)), name
-        coverage, curve = risk.risk_coverage(p)
-        loss = risk.cap_error(p.answered().error).tolist()
-        assert coverage.tolist() == pytest.approx([k / n for k in range(1, len(loss) + 1)])
-        assert curve.tolist() == pytest.approx(plain_curve(loss, p.answered().score.tolist()))
-        best = risk.risk_coverage(p, oracle=True)[1]
-        assert best.tolist() == pytest.approx(plain_curve(loss, [-e for e in loss])) and (best <= curve + 1e-12).all()
 
 
 TIED = with_errors([0.0] * 10 + [0.0, 0.0, 1.0, 1.0], torch.tensor([3.0] * 10 + [2.0] * 4))
@@ -162,20 +96,6 @@ def test_a_cut_through_equal_scores_takes_the_middles_of_equal_parts_of_the_tie(
     for order in (torch.arange(11), torch.arange(11).flip(0)):
         found = sorted(risk.keep_surest(p[order], n).answered().error.tolist())
         assert found == pytest.approx(sorted([*(sorted(error[:9])[k] for k in tied), 1 / 9]))
-
-
-def test_sparsification_equals_a_plain_loop():
-    g = torch.Generator().manual_seed(5)
-    error, score = torch.rand(2, 400, generator=g, dtype=torch.float64)
-    scored = lambda s: errors.make_points(1 + error, torch.ones_like(error), s)  # noqa: E731
-    left, best = ([float(error[order][: round(4 * (100 - k))].mean()) for k in range(96)] for order in (
-        score.argsort(descending=True), error.argsort()
-    ))  # fmt: skip
-    area = statistics.mean(a - b for a, b in zip(left, best, strict=True))
-    expected = area / (float(error.mean()) - statistics.mean(best))
-    found = [risk.ause(scored(s)) for s in (score, -error, torch.ones_like(error), error)]
-    assert found[:3] == pytest.approx([expected, 0, 1], abs=1e-12) and found[3] > 1.5
-    assert risk.ause(SILENT) is None and risk.ause(with_errors([0.25] * 3)) is None
 
 
 KNEE = [0.6, 0.5, 0.35, 0.2, 0.1], [0.13, 0.11, 0.08, 0.075, 0.07]

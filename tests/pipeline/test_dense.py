@@ -12,7 +12,6 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.metrics.monotone import MonotoneTable, Sigmoid
 from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.dense import (
-    downscale_grey,
     sensor_depth_map,
 )
 from dhtorch.pytree import collate
@@ -57,23 +56,6 @@ def test_far_pixels_of_the_room_are_found_and_know_how_well(views, found):
     assert float(sure[: len(sure) // 2].mean()) < 0.7 * float(sure.mean()), "the score ranks"
 
 
-def test_under_the_true_motion_textured_pixels_are_within_hundredths(room, views):
-    """Exact pose and depth: what both views show and bears texture."""
-    fit = exact(room, 3, 11, n=512)
-    with torch.no_grad():
-        got = complete_depth(views[0], views[1], fit=fit, method=FAST["method"], planes=96)
-    depth, picture = views[2], downscale_grey(views[0], 640)[0][:, 0]
-    mean = torch.nn.functional.avg_pool2d(picture, 9, 1, 4)
-    contrast = (torch.nn.functional.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()
-    low = -torch.nn.functional.max_pool2d(-depth, 11, 1, 5)
-    smooth = torch.nn.functional.max_pool2d(depth, 11, 1, 5) < 1.05 * low  # no edge within a window
-    asked = (depth > NEAR) & (contrast > 0.02) & smooth & (got.source == Source.SWEPT)
-    error = (got.depth - depth).abs() / depth
-    assert asked.sum() > 3000
-    assert float(error[asked].median()) < 0.006
-    assert float((error[asked] < 0.01).float().mean()) > 0.7 and float((error[asked] < 0.02).float().mean()) > 0.82
-
-
 def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
     reference, other, depth = views
     sensed = reference.depth > 0
@@ -86,14 +68,6 @@ def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
     swept = sensed & (half == 0) & (fewer.source == Source.SWEPT)
     assert swept.sum() > 500
     assert float(((fewer.depth - depth).abs() / depth)[swept].median()) < 0.03, "the sweep knows near surfaces, too"
-
-
-def test_silence_has_reasons_and_no_value(found):
-    silent = ~found.keep
-    assert silent.any() and bool(found.depth[silent].isnan().all()) and bool(found.sigma[silent].isnan().all())
-    assert bool((found.score[silent] == 0).all()) and bool((found.source[silent] == Source.NONE).all())
-    assert set(found.gate.unique().tolist()) <= {Gate.ANSWER, Gate.NO_TRACK, Gate.UNCERTAIN}
-    assert bool((found.depth[found.keep] > 0).all()) and bool((found.sigma[found.keep] > 0).all())
 
 
 def test_a_camera_that_only_turns_gets_the_sensor_alone():
@@ -170,14 +144,6 @@ def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
     assert longer == pytest.approx(1.0, abs=0.03)
 
 
-def test_double_precision_goes_in_beside_pictures_of_bytes():
-    room = SyntheticRoom(n_frames=8, hw=(60, 80), depth_hw=(60, 80), lidar="exact")
-    reference, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
-    for as_given in (lambda x: x.byte(), lambda x: x.float() / 255):
-        asked, view = (frame.replace(image=as_given(frame.image)) for frame in (reference, other))
-        assert complete_depth(asked, view, **FAST).depth.dtype == torch.float64
-
-
 def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they_are(room):
     """Returns at every depth, 2 % of the pixels."""
     told = torch.rand(room[3].depth.shape, generator=torch.Generator().manual_seed(0)) < 0.02
@@ -193,16 +159,6 @@ def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they
     error = ((swept_near.depth - room[3].depth).abs() / room[3].depth)[found]
     assert float(found.sum()) > 0.2 * float((near & (swept_near.source != Source.SENSOR)).sum())
     assert float(error.median()) < 0.02 and float((error > 0.2).float().mean()) < 0.1
-
-
-def test_a_large_picture_is_swept_at_the_size_asked(views):
-    picture, camera = downscale_grey(views[0], 160)
-    assert picture.shape == (1, 1, 120, 160)
-    torch.testing.assert_close(camera.f, views[0].camera.f / 2)
-    torch.testing.assert_close(camera.c, (views[0].camera.c + 0.5) / 2 - 0.5)
-    with torch.no_grad():
-        got = complete_depth(views[0], views[1], size=160, **FAST)
-    assert got.depth.shape == (1, 120, 160) and bool((got.source == Source.SWEPT).any())
 
 
 @pytest.mark.parametrize(

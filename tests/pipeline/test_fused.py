@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
-from dhtorch.codes import Gate, Source, is_estimated
+from dhtorch.codes import Source, is_estimated
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import fused
 from dhtorch.pipeline.completion import complete_depth
-from dhtorch.pipeline.dense import selected_views, sweep_depth
 from dhtorch.pipeline.presets import FUSED
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
@@ -136,65 +133,6 @@ def test_the_map_has_returns_swept_pixels_and_joint_answers_at_samples(views, fo
     assert bool((answered == (sensed | is_estimated(depth_map.source))).all())
 
 
-def estimate_of(depth, score=1.0, uv=0.0):
-    """An estimate of samples with depth (1, N) m, all answered."""
-    one = torch.ones_like(depth)
-    return fused.Estimate(
-        uv=uv * torch.ones(*depth.shape, 2), depth=depth, sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
-        residual_px=one, n_views=2 * one.int(), score=score * one, gate=0 * one.int(),
-    )  # fmt: skip
-
-
-def inserted(*, weight=1.0, usable=(False, False, False)):
-    """Three joint answers of the same ``weight`` in a map of 5 x 5 pixels whose first one is answered; two are at (1, 1)
-    beside it."""
-    swept = fused.DepthMap(
-        *(torch.full((1, 5, 5), v) for v in (torch.nan, torch.nan, 0.0)),
-        torch.zeros(1, 5, 5, dtype=torch.int32),
-        torch.full((1, 5, 5), Gate.NO_TRACK, dtype=torch.int32),
-    )
-    swept.gate[0, 0, 0] = Gate.ANSWER
-    at = torch.tensor([[[1.0, 1.0], [4.0, 4.0], [1.0, 1.0]]])
-    one = torch.ones(1, 3)
-    estimate = estimate_of(torch.tensor([[2.0, 3.0, 4.0]]), torch.tensor([[0.3, 0.9, 0.6]]), at)
-    answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int(), one[None])
-    joint = fused._Joint(one.bool(), weight * one, one, answer, answer)
-    selected = SimpleNamespace(samples=SimpleNamespace(usable=torch.tensor([usable])))
-    return fused._insert(swept, at, estimate, selected, joint)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("options", "depth", "source"),
-    [
-        ({}, 4.0, Source.RECOVERED),  # of two samples at a pixel that with the larger score
-        ({"weight": 0.4}, 4.0, Source.SWEPT),
-        ({"weight": 0.6}, 4.0, Source.RECOVERED),
-        ({"usable": (False, False, True)}, 2.0, Source.RECOVERED),  # none is at a return
-        ({"usable": (True, False, True)}, None, Source.NONE),
-    ],
-)
-def test_joint_answers_stand_in_the_map_beside_answered_pixels(options, depth, source):
-    found = inserted(**options)
-    assert int(found.source[0, 1, 1]) == source
-    assert found.depth[0, 1, 1].isnan() if depth is None else float(found.depth[0, 1, 1]) == depth
-    assert bool(found.depth[0, 4, 4].isnan()) and int(found.gate[0, 4, 4]) == Gate.NO_TRACK
-
-
-def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(views, found):
-    _, trace = found
-    selected = selected_views(trace["sparse"], views[1], trace)
-    shared = float(fused._shared_error(selected))
-    sparse = trace["sparse"]
-    counts = sparse.keep & ~trace["samples"].usable
-    expected = float((sparse.sigma_shared / sparse.depth**2)[counts].median())
-    assert shared == pytest.approx(expected, rel=1e-6) and shared > 0
-    depth_map = trace["dense"]
-    swept = depth_map.source == Source.SWEPT
-    assert bool((depth_map.sigma[swept] >= 0.999 * shared * depth_map.depth[swept].square()).all())
-    few = selected._replace(joined=sparse.replace(gate=torch.where(counts, Gate.UNCERTAIN, sparse.gate)))
-    assert float(fused._shared_error(few)) == 0
-
-
 def test_complete_depth_and_the_method_give_one_product(views, found):
     estimate, trace = found
     again = {}
@@ -204,16 +142,6 @@ def test_complete_depth_and_the_method_give_one_product(views, found):
         assert torch.equal(getattr(depth_map, name).nan_to_num(), getattr(trace["dense"], name).nan_to_num()), name
         if name != "source":
             assert torch.equal(getattr(again["fused"], name).nan_to_num(), getattr(estimate, name).nan_to_num()), name
-
-
-@pytest.mark.slow
-def test_without_the_stage_the_map_is_the_sweep_alone(views):
-    method, trace = METHOD.replace(complete=None), {}
-    with torch.no_grad():
-        depth_map = complete_depth(*views, method=method, planes=48, trace=trace)
-        swept = sweep_depth(views[0], selected_views(trace["sparse"], views[1], trace), method=method, planes=48)
-    assert torch.equal(depth_map.depth.nan_to_num(), swept.depth.nan_to_num())
-    assert torch.equal(trace["fused"].depth.nan_to_num(), trace["sparse"].depth.nan_to_num())
 
 
 @pytest.mark.slow

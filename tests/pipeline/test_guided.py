@@ -67,17 +67,6 @@ def test_a_wrong_prior_does_not_lower_coverage():
 
 
 @pytest.mark.slow
-def test_a_right_prior_does_not_lower_coverage_with_several_views():
-    (whole, *others), poses = orbit(15, -15, 25)
-    views, prior = stack(others), stack([make_prior(T) for T in poses])
-    without, _ = measured(GUIDED, whole, views)
-    found, trace = measured(GUIDED, whole, views, fit=prior)
-    assert found["coverage"] >= without["coverage"] > 0.5
-    assert found["median_rel"] < 0.02
-    assert len(trace["views"]) == 3
-
-
-@pytest.mark.slow
 def test_of_many_views_those_are_selected_that_a_prior_shows_from_a_similar_side():
     (whole, *others), poses = orbit(90, 15, -60, -15)
     views, prior = stack(others), stack([make_prior(T) for T in poses])
@@ -118,23 +107,6 @@ def test_a_match_has_the_gradient_of_a_trackers_last_step():
     (gradient,) = torch.autograd.grad(estimate.depth[answered].sum(), image)
     assert gradient.isfinite().all()
     assert gradient.abs().sum() > 0
-
-
-@pytest.mark.slow
-def test_without_a_guide_nothing_is_searched():
-    (whole, other), (T,) = orbit(15)
-    calls = []
-
-    def guide(*arguments, **options):
-        calls.append(1)
-        return AUTO.guide(*arguments, **options)
-
-    measured(PLAIN, whole, other, fit=make_prior(T))
-    assert not calls
-    measured(GUIDED.replace(guide=guide), whole, other)  # most samples are tracked
-    assert not calls
-    measured(GUIDED.replace(guide=guide), whole, other, fit=make_prior(T))
-    assert len(calls) == 3  # under the prior's pose, under the refined one, and for what no track answers
 
 
 @pytest.mark.slow

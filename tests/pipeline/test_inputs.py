@@ -40,50 +40,6 @@ def test_frames_that_cannot_be_are_named(views, method, change, error, message):
         method(*change(*views[:2]))
 
 
-def bytes_of(frame):
-    return frame.image if frame.image.dtype == torch.uint8 else (frame.image * 255).round().to(torch.uint8)
-
-
-IMAGES = {
-    r"is int64, expected uint8, or floating point in \[0, 1\]": lambda x: x.long(),
-    "is int32, expected uint8": lambda x: x.int(),
-    "is int16, expected uint8": lambda x: x.short(),
-    "is uint16, expected uint8": lambda x: x.to(torch.uint16),
-    "is bool, expected uint8": lambda x: x > 128,
-    r"has shape \(1, 4, 96, 128\), .*C 1 or 3": lambda x: torch.cat([x, x[:, :1]], 1),
-    r"has shape \(1, 96, 128, 3\), .*C 1 or 3": lambda x: x.permute(0, 2, 3, 1),
-    r"has values up to .*, expected \[0, 1\]": lambda x: x.float(),
-}
-
-
-@pytest.mark.parametrize("message", IMAGES)
-def test_images_of_another_kind_are_named_in_either_view(views, message):
-    reference, other, _ = views
-    changed = [frame.replace(image=IMAGES[message](bytes_of(frame))) for frame in (reference, other)]
-    with pytest.raises(ValueError, match=f"reference.image {message}"):
-        PAPER(changed[0], other)
-    with pytest.raises(ValueError, match=f"other.image {message}"):
-        PAPER(reference, changed[1])
-
-
-@pytest.mark.parametrize("dtype", [torch.uint16, torch.int16, torch.int32, torch.int64, torch.bool])
-def test_depth_of_whole_numbers_is_named(views, dtype):
-    reference, other, _ = views
-    depth = (1000 * reference.depth).to(torch.int32).to(dtype)
-    with pytest.raises(ValueError, match=r"reference.depth is u?\w+, expected floating point, m"):
-        PAPER(reference.replace(depth=depth), other)
-    assert PAPER.replace(n=16)(reference, other.replace(depth=depth[..., :1])).depth.shape == (1, 16), "it is not read"
-
-
-def test_images_of_bytes_and_of_any_floating_dtype_have_answers(views):
-    reference, other, _ = views
-    answers = []
-    for kind in (lambda x: x, lambda x: x.float() / 255, lambda x: x.double() / 255, lambda x: 1.5 * x.float() / 255):
-        a, b = (frame.replace(image=kind(bytes_of(frame))) for frame in (reference, other))
-        answers.append(int((PAPER.replace(n=64)(a, b).gate == 0).sum()))
-    assert min(answers) > 0
-
-
 def test_the_depth_of_other_views_may_be_missing(views):
     reference, other, _ = views
     blind = other.replace(depth=other.depth[:, :0, :0])

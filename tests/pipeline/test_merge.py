@@ -3,7 +3,6 @@
 import itertools
 
 import numpy as np
-import pytest
 import torch
 
 from dhtorch import extend
@@ -11,7 +10,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws, upcast_intrinsics
+from dhtorch.pipeline.pair import merge, undistort_tracks, upcast_intrinsics
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
 
 HW = (20, 30)
@@ -122,30 +121,7 @@ def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
         assert upcast_intrinsics(plain).camera is plain.camera and upcast_intrinsics(plain).depth_camera is None
 
 
-def test_views_of_another_shape_or_number_are_refused():
-    for bad in (frame(1), frame(2).replace(image=frame(2).image[:, 0]), frame(2).replace(image=frame(1).image)):
-        for views in ((frame(2), bad), (bad, frame(2))):
-            with pytest.raises(ValueError, match="extend"):
-                extend(*views, n=12)
-    with pytest.raises(ValueError, match="expected"):
-        extend(frame(2).replace(depth=frame(2).depth[0]), frame(2))
-
-
 # ---------------------------------------------------------------------------------------------------- draws
-
-
-def test_the_draws_of_a_pair_hang_on_its_seed_alone():
-    def plain(seed, n):
-        return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-    same, own = uniform_draws(5, 3, 4), uniform_draws(torch.tensor([9, 5, 2**40]), 3, 4)
-    assert same.shape == own.shape == (3, 4, 3) and own.dtype == torch.float64
-    for b in range(3):
-        assert torch.equal(same[b], plain(5, 4)) and torch.equal(own[b], plain([9, 5, 2**40][b], 4))
-    assert uniform_draws(torch.zeros(0, dtype=torch.int64), 0, 4).shape == (0, 4, 3)
-    for bad in (torch.tensor([1, 2]), torch.tensor(1), torch.tensor([[1, 2, 3]])):
-        with pytest.raises(ValueError, match="seed has shape"):
-            uniform_draws(bad, 3, 4)
 
 
 # ---------------------------------------------------------------------------------------------------- lenses

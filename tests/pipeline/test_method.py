@@ -19,7 +19,6 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines.opencv import OPENCV
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import GONE_METHODS, get_method
-from dhtorch.pipeline.spec import iter_networks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
@@ -126,22 +125,6 @@ def test_replace_changes_a_stage_or_its_options_and_nothing_else():
             PAPER.replace(**wrong)
 
 
-def test_a_pose_from_elsewhere_takes_the_place_of_stage_5(room):
-    trace = {}
-    found = USUAL(room[0], room[3], trace=trace)
-
-    def nobody(*_):
-        raise AssertionError("there is a pose")
-
-    assert alike(found, USUAL(room[0], room[3], fit=trace["fit"], pose=nobody))
-
-
-def test_options_of_a_call_are_those_of_a_record(room):
-    direct = PAPER(room[0], room[3], n=N, track={"levels": 1})
-    assert alike(direct, PAPER.replace(n=N, track={"levels": 1})(room[0], room[3]))
-    assert not alike(direct, USUAL(room[0], room[3]))
-
-
 def test_a_hint_is_cut_with_its_pairs_and_may_be_ignored(room):
     seen = []
 
@@ -154,12 +137,6 @@ def test_a_hint_is_cut_with_its_pairs_and_may_be_ignored(room):
     found = PAPER(*many, n=N, track=blind, hint=TrackHint(start, levels=3))
     assert [len(h.start) for h in seen] == [8, 2] and torch.equal(seen[1].start, start[8:])
     assert all(h.levels == 3 for h in seen) and alike(found[9:], USUAL(room[0], room[3]))
-
-
-def test_networks_of_a_method_are_found_in_partials():
-    net, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
-    method = PAPER.replace(score=net, pose=partial(partial(pnp_ransac, other), solver=net))
-    assert list(iter_networks(method)) == [other, net, net] and not list(iter_networks(PAPER, MAP))
 
 
 def test_several_views_must_be_some(room):

@@ -8,7 +8,6 @@ from support import textured_box as walls
 
 from dhtorch import PAPER, extend, pytree
 from dhtorch.codes import Gate
-from dhtorch.experiments.baselines import opencv
 from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
@@ -44,14 +43,6 @@ def test_without_chain_it_is_the_pairs_fused(room):
     assert (window.n_views[window.keep] >= 3).all()
 
 
-def test_it_answers_what_its_widest_pair_answers(room):
-    reference, others = room
-    window, pair = extend_window(reference, others, **PAIR), extend(reference, others[-1], **PAIR)
-    both = window.keep & pair.keep
-    assert both.sum() > 0.95 * pair.keep.sum()
-    assert (window.depth / pair.depth - 1).abs()[both].median() < 0.03
-
-
 @pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_affine])
 def test_answers_do_not_depend_on_batch_mates(room, track):
     reference, others = room
@@ -73,19 +64,6 @@ def test_one_view_is_a_pair(room):
     best = pairs[rank_views(pairs, 1).index[0], torch.arange(2)]
     chosen = extend_window(reference, others, views=1, chain=False, **PAIR)
     assert torch.equal(chosen.gate, best.gate) and torch.equal(chosen.depth.nan_to_num(), best.depth.nan_to_num())
-
-
-def test_any_tracker_and_given_poses(room):
-    reference, others = room
-    trace = {}
-    extend_window(reference, others, trace=trace, **PAIR)
-    fit = pytree.stack([t["fit"] for t in trace["views"]])
-    given, found = extend_window(reference, others, fit=fit, **PAIR), trace["estimate"]
-    assert torch.equal(given.gate, found.gate)
-    plain = extend_window(
-        reference, others, track=opencv.opencv_lucas_kanade, **PAIR
-    )  # takes neither start nor pyramid
-    assert (plain.gate > 0).all()  # it states no covariance: nothing to weigh its answers by
 
 
 def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room):
@@ -127,15 +105,6 @@ def test_wrong_shapes_raise(room):
     for bad in (others[:, :1], others[0][:1], others[:0], []):
         with pytest.raises(ValueError, match=r"extend|method"):
             extend_window(reference, bad, **PAIR)
-
-
-def test_several_views_come_as_one_record_or_as_a_sequence(room):
-    reference, others = room
-    one, many = (
-        extend_window(reference, others, **PAIR),
-        extend_window(reference, [others[k] for k in range(3)], **PAIR),
-    )
-    assert torch.equal(one.gate, many.gate) and torch.equal(one.depth.nan_to_num(), many.depth.nan_to_num())
 
 
 def test_gradients_reach_images_and_depth(room):

@@ -79,19 +79,6 @@ def test_an_answer_does_not_depend_on_its_company(views):
             assert torch.equal(x.nan_to_num(-1), y.nan_to_num(-1)), (b, k, name)
 
 
-def test_threads_change_rounding_at_most(views):
-    pairs = together(views[0])
-    torch.set_num_threads(2)
-    two = extend(*pairs, n=200)
-    torch.set_num_threads(1)
-    one = extend(*pairs, n=200)
-    both = one.keep & two.keep
-    assert ((one.depth - two.depth).abs()[both] <= 1e-3 * one.sigma[both]).all()
-    differ = one.gate != two.gate
-    near_threshold = ((one.parallax_deg - 0.3).abs() < 3e-5) | ((one.residual_px - 3).abs() < 3e-4)
-    assert not (differ & ~near_threshold).any()
-
-
 def test_every_pair_may_have_its_own_seed(views):
     pairs = views[0][:2]
     seeds = torch.tensor([5, 9])

@@ -91,16 +91,6 @@ def test_a_cut_is_noticed_and_the_past_forgotten(frames: list[Frame], elsewhere:
     assert not is_scene_cut(frames[0], dark) and not is_scene_cut(dark, frames[1]), "nothing is told by a black picture"
 
 
-def test_after_a_reset_it_is_as_new(frames: list[Frame]) -> None:
-    stream = Stream(FAST, steps=(1, 2))
-    stream.push(frames[3])
-    stream.reset()
-    assert stream.nbytes == 0
-    fresh = Stream(FAST, steps=(1, 2))
-    for k in (0, 1, 2):
-        assert same(stream.push(frames[k]), fresh.push(frames[k]))
-
-
 @pytest.mark.slow
 def test_the_command_streams_a_recording(tmp_path, capsys) -> None:
     options = ["data=synthetic", "data.n_frames=4", "data.hw=[192,256]", "method.n=256", "method.views=2"]

@@ -61,12 +61,6 @@ def equal(a, b):
     )
 
 
-def test_the_wall_is_found(scene):
-    found = mapped(scene)
-    told = found.source == Source.SWEPT
-    assert told.float().mean() > 0.15 and float((found.depth[told] / 3.0 - 1).abs().median()) < 0.03
-
-
 def test_pixels_of_a_map_stand_for_what_they_cover(scene):
     reference, _ = scene
     uv = dense.map_pixel_centres(reference, (30, 40)).unflatten(0, (30, 40))
@@ -74,13 +68,6 @@ def test_pixels_of_a_map_stand_for_what_they_cover(scene):
     picture, camera = dense.downscale_grey(reference, 40)
     torch.testing.assert_close(picture[0, 0, 3, 5], reference.image[0, 0, 6:8, 10:12].mean())
     torch.testing.assert_close(camera.c, (reference.camera.c + 0.5) / 2 - 0.5)
-
-
-def test_what_the_motion_does_not_know_is_in_sigma(scene):
-    reference, asked = scene
-    sure, unsure = mapped(scene), mapped((reference, asked._replace(fits=asked.fits.replace(cov=400 * asked.fits.cov))))
-    both = (sure.source == Source.SWEPT) & (unsure.source == Source.SWEPT)
-    assert both.sum() > 100 and float((unsure.sigma / sure.sigma)[both].median()) > 1.5
 
 
 def test_no_depth_is_surer_than_the_sensors_metre(scene):
@@ -106,47 +93,11 @@ def test_a_few_returns_refute_no_motion(scene):
     assert bool((mapped((reference.replace(depth=few), wrong)).source == Source.SWEPT).any())
 
 
-@pytest.mark.parametrize(
-    ("module", "name", "change", "options", "gate"),
-    [
-        (surface, "sweep_planes", lambda x: x._replace(alone=torch.zeros_like(x.alone)), {}, Gate.UNCERTAIN),
-        (plane_sweep, "occlusion_mask", torch.ones_like, {}, Gate.NO_TRACK),
-        (plane_sweep, "fit_windows", lambda x: x._replace(correlation=0 * x.correlation + 0.4), {"min_correlation": 0.0}, None),
-        (plane_sweep, "fit_windows", lambda x: x._replace(correlation=0 * x.correlation + 0.6), {"min_correlation": 0.65}, Gate.NO_TRACK),
-    ],
-)  # fmt: skip
-def test_nothing_is_swept_that_fits_elsewhere_is_hidden_or_hardly_fits(
-    scene, monkeypatch, module, name, change, options, gate
-):
-    found = getattr(module, name)
-    monkeypatch.setattr(module, name, lambda *a, **k: change(found(*a, **k)))
-    depth_map = mapped(scene, **options)
-    assert not bool((depth_map.source == Source.SWEPT).any()) and bool((depth_map.source == Source.NONE).any())
-    silent = depth_map.gate[depth_map.source == Source.NONE]
-    assert gate is None or bool((silent == gate).any() if gate == Gate.UNCERTAIN else (silent == gate).all())
-
-
 def test_what_moves_on_its_own_silences_every_pixel(scene):
     reference, asked = scene
     gate = torch.where(asked.joined.keep, Gate.CONTRADICTED, asked.joined.gate)
     found = mapped((reference, asked._replace(joined=asked.joined.replace(gate=gate))))
     assert set(found.gate[found.source != Source.SENSOR].tolist()) == {int(Gate.CONTRADICTED)}
-
-
-def test_a_rival_is_a_place_that_costs_nearly_as_little(scene, monkeypatch):
-    """Costs made by hand: one plane that fits, and another far away that fits as well, or not at all."""
-    reference, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
-    index, wanted = dense.top_views(asked, 1)
-    source_view = [dense.source_view_of(asked, index[0], 80, wanted[0], base.image)]
-    q = torch.linspace(0, 1, 32)[None]
-    for second, alone in ((0, False), (25, True)):
-        costs = torch.full((1, *base.hw, 32), 30, dtype=torch.uint8)
-        costs[..., 8], costs[..., 28] = 0, second
-        monkeypatch.setattr(surface, "_costs", lambda *_, costs=costs: costs)
-        found = surface.sweep_planes(base, source_view, q)
-        assert bool((found.alone == alone).all())
-        torch.testing.assert_close(found.q, torch.full_like(found.q, 8 / 31), atol=0.5 / 31, rtol=0)
 
 
 def test_views_that_are_of_no_use_to_one_of_a_batch_say_nothing_of_it(scene):
@@ -161,64 +112,6 @@ def test_views_that_are_of_no_use_to_one_of_a_batch_say_nothing_of_it(scene):
     )
     found = mapped((collate([reference] * 2), lost(twice, 1, 0)), source_views=2)
     assert equal(found[:1], alone) and equal(found[1:], both)
-
-
-def changed(monkeypatch, change):
-    """Windows that tell something else: ``change`` of the view and of what a fit finds."""
-    fit = plane_sweep.fit_windows
-    monkeypatch.setattr(plane_sweep, "fit_windows", lambda base, view, *a, **k: change(view, fit(base, view, *a, **k)))
-
-
-def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):
-    def of_the_second(view, f):
-        return f._replace(correlation=0 * f.correlation + 0.6) if view.T_1_from_0.t[0, 0] > 0 else f
-
-    plain = mapped(scene, source_views=2)
-    changed(monkeypatch, of_the_second)
-    found = mapped(scene, source_views=2)
-    assert int((found.source == Source.SWEPT).sum()) > 0.6 * int((plain.source == Source.SWEPT).sum()) > 100
-
-
-def test_pixels_of_a_window_err_together(scene):
-    plain = mapped(scene)
-    independent = DenseOptions(independent_window_pixels=4 * DenseOptions.independent_window_pixels)
-    found = mapped(scene, options=independent)
-    both = (plain.source == Source.SWEPT) & (found.source == Source.SWEPT)
-    assert both.sum() > 50 and float((found.sigma / plain.sigma)[both].median()) < 0.9
-
-
-def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
-    reference, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
-    source_view = [dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image)]
-    q = torch.linspace(0, 1, 24)[None]
-    start = surface.sweep_planes(base, source_view, q)
-    changed(monkeypatch, lambda _view, f: f._replace(step=1e4 * f.step))
-    with torch.no_grad():
-        found = surface.refine_surface(base, source_view, start, q, 2)
-    assert (
-        float((found.q - start.q).abs().max()) * 23
-        < DenseOptions.max_total_planes + DenseOptions.max_step_planes + DenseOptions.surface_planes
-    )
-
-
-@pytest.mark.parametrize(("views", "planes"), [((1,), 1.0), ((0, 1), 0.5)])
-def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, scene, monkeypatch):
-    """The second view asks for a place far away, the first, as sure, for none: they meet in between."""
-    reference, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
-    source_views = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
-    q = torch.linspace(0, 1, 24)[None]
-    start = surface.SweptSurface(torch.full((1, *base.hw), 0.4), torch.zeros(1, *base.hw), torch.tensor(True))
-    even = dict.fromkeys(("contrast", "noise", "correlation"), torch.ones(1, *base.hw))
-
-    def astray(view, f):
-        return f._replace(step=torch.full_like(f.step, 1e4 if view.T_1_from_0.t[0, 0] > 0 else 0.0), **even)
-
-    changed(monkeypatch, astray)
-    with torch.no_grad():
-        found = surface.refine_surface(base, source_views, start, q, 1)
-    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * DenseOptions.max_step_planes, rel=1e-3)
 
 
 def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line(scene):

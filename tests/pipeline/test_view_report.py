@@ -11,8 +11,6 @@ from support.rooms import room_scene
 from dhtorch.cli import run
 from dhtorch.data.pairs import by_choice, by_gap
 from dhtorch.experiments import pair, protocol
-from dhtorch.experiments.exhibits import make_exhibit
-from dhtorch.experiments.paper import global_map, heldout, range_split
 from dhtorch.integrate import recording as maps
 from dhtorch.pipeline.presets import AUTO, MAP, PAPER
 from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view_selection
@@ -52,27 +50,6 @@ def test_every_method_chooses_among_what_is_offered(outcome):
     assert of["paper"] == of["map"], "all choose alike"
     for name in ("window", "auto"):
         assert all(one[0] in two for one, two in zip(of["map"], of[name], strict=True)), "the best is chosen first"
-
-
-def test_a_single_view_answers_as_the_pair_does(room):
-    reference, others = room[0], [room[k] for k in (1, 2, 4)]
-    trace = {}
-    found = with_view_selection(SMALL["map"])(reference, stack(others), trace=trace)
-    k = int(trace["choice"].index[0, 0])
-    alone = SMALL["map"](reference, others[k])
-    for name in ("depth", "sigma", "gate", "score"):
-        assert torch.equal(getattr(found, name).nan_to_num(), getattr(alone, name).nan_to_num()), name
-    assert bool(found.keep.any())
-
-
-def test_rows_do_not_depend_on_the_batch(room, outcome):
-    again = pair.run([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, batch=2))
-    assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
-
-
-def _told(outcome):
-    """Rows of pairs without their times."""
-    return [{k: v for k, v in row.items() if k != "ms"} for row in outcome.rows if row["pair"] is not None]
 
 
 def test_what_chooses_for_itself_is_asked_as_it_is():
@@ -119,25 +96,11 @@ def test_what_a_view_adds_and_which_say_nothing(room):
     assert float(choice.gain[best - 1, 0]) == float(one.gain[0, 0]) == float(choice.gain.max())
 
 
-def test_experiments_that_cannot_choose_say_what_to_say(room):
-    for run_it in (heldout.run, range_split.run, global_map.run):
-        with pytest.raises(ValueError, match=r"candidate frames \(pairs=auto\).*pairs=gap"):
-            run_it([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf))
-
-
 def test_two_frames_are_each_others_view():
     two = SyntheticRoom(hw=(120, 160), n_frames=2, supersample=1, step_m=0.08, lidar="exact")
     found = pair.run([room_scene(two)], {"auto": SMALL["auto"]}, by_choice, protocol.Settings(cutoff=math.inf))
     rows = [r for r in found.rows if r["pair"] is not None]
     assert [(r["pair"], r["views"], r["why"]["gain"]) for r in rows] == [([0, 1], [1], None), ([1, 0], [0], None)]
-
-
-def test_what_is_shown_is_the_last_view_that_was_asked(room):
-    shown = make_exhibit(room_scene(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
-    (shot,) = shown.shots
-    j = int(shot.label.split(" → ")[1])
-    assert shot.label.startswith("0 → ") and shown.views[shot.view_1].number == j
-    assert shot.facts["views"].startswith(f"view {j}, chosen of 3")
 
 
 def test_a_map_knows_all_views_and_links_them(room):
