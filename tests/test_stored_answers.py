@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 import test_contract
 import torch
-from support import digests
+from support import digests, sample_dicts, stub_samples
 from support.random_answers import random_points
 from support.room_models import room_model, room_scene
 from support.stored_values import stored_values
+from torch.utils.data import default_collate
 
 from dhtorch import CameraPin, align_depth, complete_depth, validate_depth
 from dhtorch.alignment.references import collect_references
@@ -29,6 +30,7 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom, depth_faults
+from dhtorch.transforms import ExtendDepth, ValidateDepth
 from dhtorch.validation.capture_check import check_capture
 from dhtorch.validation.faults import diagnose
 
@@ -199,6 +201,40 @@ def held_out():
     return found | {"holes": [holdout.select_real_holes(views["sparse"], samples, truth, **more) for more in changes]}
 
 
+#: Options of the transform -> the columns that they change; no name: all.
+EXTENDED = {
+    "pair": ({}, ()),
+    "one view": ({"other_image": None}, ()),
+    "lens": ({"distortion": [0.05, -0.02, 0.01, -0.01]}, ("xyz", "depth", "sigma")),
+    "seed": ({"index_key": "index", "seed": 3}, ("pose_cov",)),
+    "pad": ({"patch": 5, "tokens_hw": (30, 20), "fit": "pad"}, ("tokens", "tokens_valid")),
+    "crop": ({"patch": 8, "tokens_hw": (64, 32), "fit": "crop"}, ("tokens", "tokens_valid")),
+    "depth camera": ({"depth_intrinsics": [40.0, 42.0, 50.0, 48.0], "confidence": "conf"}, ("depth", "flag", "source")),
+    "dense": (
+        {"dense": {"planes": 16, "size": 64}, "budget": True},
+        ("depth_map", "sigma_map", "gate_map", "cause_map", "tokens"),
+    ),
+}
+
+
+def extended():
+    """What the transform adds to a sample, and a validation to a batch."""
+    first, given = sample_dicts.frames()[0], sample_dicts.frames()[6]
+    given = given | {"before": first["image"], "conf": (given["depth"] // 500).clip(0, 2).astype("uint8")}
+    found, common = {}, {"depth_unit": "mm", "other_image": "before", "n": 128}
+    for name, (options, columns) in EXTENDED.items():
+        out = stub_samples.added(ExtendDepth(**common | options)(given))
+        found[name] = {k: out[k] for k in columns or out}
+    clipped = (1.05 * sample_dicts.room().truth(6)["depth"][0]).clamp(max=3.0)
+    given = [
+        given | {"before_is_pad": torch.tensor([pad]), "map": x}
+        for pad in (False, True)
+        for x in (clipped, 0 * clipped)
+    ]
+    validate = ValidateDepth(**common, map="map", judging={"size": 112}, batched=True)
+    return found | {"validated": stub_samples.added(validate(default_collate(given)))}
+
+
 def measured():
     """The metric size of a model of the room."""
     model, _ = room_model("maps", "bend", 0.02)
@@ -240,6 +276,7 @@ PROBLEMS = {
     "metrics": metrics_of_points,
     "metrics of scenes": metrics_of_scenes,
     "held-out truth": held_out,
+    "extend samples": extended,
     "coarse flow": flow,
     "scale of a model": measured,
     "pinned camera": pinned,
@@ -265,7 +302,7 @@ PROBLEMS |= calls()
 #: Differences allowed, by the beginnings of names, where a part computes in single precision.
 TOLERANCES = {
     **dict.fromkeys(("pair window", "pair auto", "pair fused", "batch", "complete", "validate", "align affine"), 0.01),
-    **dict.fromkeys(("diagnose", "check", "scale of a model"), 0.01),
+    **dict.fromkeys(("diagnose", "check", "scale of a model", "extend samples"), 0.01),
     **{"pair": 1e-4, "references": 1e-4, "pinned camera": 1e-4, "align": 1e-3},
 }
 

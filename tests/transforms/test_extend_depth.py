@@ -17,9 +17,8 @@ from torch.utils.data import default_collate
 import dhtorch
 from dhtorch import MAP, PAPER
 from dhtorch.codes import Flag, Gate, Source
-from dhtorch.geometry import camera as cam
 from dhtorch.pipeline import completion, dense
-from dhtorch.records import DepthValidation, Frame, MergedDepth
+from dhtorch.records import MergedDepth
 from dhtorch.stages import score
 from dhtorch.transforms import (
     DenseMaps,
@@ -28,9 +27,7 @@ from dhtorch.transforms import (
     SampleError,
     SampleProblem,
     SampleSpec,
-    ValidateDepth,
     patch_tokens,
-    validate_depth,
 )
 
 N, P, SIZE = 256, (SIDE // 14) ** 2, 84
@@ -153,56 +150,7 @@ def test_shapes_are_fixed_and_numbers_finite(sample, make, name):
         assert same(out, added(make(other_image=None)(sample)))
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_a_map_with_one_return_where_no_sample_is_has_depth(sample, batched):
-    maps = [sample["depth"], 0 * sample["depth"], 0 * sample["depth"]]
-    seen = added(sparse(other_image=None)(sample))["uv"].round().long()
-    at = next((v, u) for v in range(SIDE) for u in range(SIDE) if not (seen == torch.tensor([u, v])).all(-1).any())
-    maps[1][at] = 1500
-    samples, transform = [sample | {"depth": x} for x in maps], sparse(other_image=None, batched=batched)
-    out = (
-        added(transform(default_collate(samples)))["problem"]
-        if batched
-        else [transform(s)["dhtorch.problem"] for s in samples]
-    )
-    assert list(out) == [SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_DEPTH]
-
-
 # ------------------------------------------------------------------------------------------------ cameras and methods
-
-
-def test_two_cameras_answer_as_the_method_with_two_cameras(sample, items):
-    """The other view cut out eight pixels further left: an image with a K of its own."""
-    K = sample["intrinsics"]
-    sample["before"] = np.pad(sample["before"], ((0, 0), (8, 0), (0, 0)), "edge")[:, :SIDE]
-    sample["K_before"] = K + np.float32([[0, 0, 8], [0, 0, 0], [0, 0, 0]])
-    image, before = (torch.from_numpy(sample[k]).permute(2, 0, 1)[None] for k in ("image", "before"))
-    mm = torch.from_numpy(sample["depth"].astype(np.float32))[None]
-    one, two = (cam.from_matrix(torch.from_numpy(x)[None]) for x in (K, sample["K_before"]))
-    trace = {}
-    estimate = dhtorch.extend(Frame(image, mm / 1000, one), Frame(before, 0 * mm, two), n=N, trace=trace)
-    found = dhtorch.merge(trace["samples"], estimate)
-    own, shared = (added(sparse(other_intrinsics=k)(sample)) for k in ("K_before", None))
-    assert torch.equal(own["depth"], found.depth[0]) and torch.equal(own["sigma"], found.sigma[0])
-    assert torch.equal(own["T_1_from_0"][:3, 3], trace["fit"].T_1_from_0.t[0]) and own["pose_ok"]
-    assert not torch.allclose(own["T_1_from_0"], shared["T_1_from_0"], atol=1e-3)
-    plain = added(sparse()({**sample, "before": items[0]["image"]}))["T_1_from_0"]
-    apart, wrong = ((x["T_1_from_0"] - plain).abs().max() for x in (own, shared))
-    assert apart < 0.02 < wrong, "the same motion, whatever was cut out"
-
-
-def test_a_depth_map_of_its_own_size_and_camera_and_low_confidence(sample):
-    half, K = sample["depth"][1::2, 1::2], sample["intrinsics"]
-    # Pixels 1, 3, 5, … of the image: a camera whose pixel centres are exactly those.
-    own = [K[0, 0] / 2, K[1, 1] / 2, (K[0, 2] - 1) / 2, (K[1, 2] - 1) / 2]
-    out, whole = added(sparse(depth_intrinsics=own)({**sample, "depth": half})), added(sparse()(sample))
-    both = (out["source"] == Source.SENSOR) & (whole["source"] == Source.SENSOR)
-    assert both.sum() > 20 and ((out["depth"] / whole["depth"])[both] - 1).abs().median() < 0.01
-    conf = np.zeros((SIDE, SIDE), np.uint8)
-    conf[: SIDE // 2] = 2
-    out = added(sparse(confidence="conf")({**sample, "conf": conf}))
-    low = (out["flag"] & Flag.LOW_CONF) != 0
-    assert low.any() and (out["uv"][low][:, 1] >= SIDE // 2 - 0.5).all() and (out["source"][low] != Source.SENSOR).all()
 
 
 class Scorer(torch.nn.Module):
@@ -388,52 +336,3 @@ def test_options_of_maps_are_checked_when_it_is_made_and_default_to_those_of_the
 
 
 # ----------------------------------------------------------------------------------------------- tokens and validation
-
-
-@pytest.mark.slow
-def test_tokens_stand_beside_dinov2_and_both_learn():
-    transformers = pytest.importorskip("transformers")
-    source = room()
-    near = [torch.where(source[i].depth <= NEAR, source[i].depth, 0.0) for i in (0, GAP)]
-    sizes = {"hidden_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 14, "image_size": SIDE}
-    network = transformers.Dinov2Model(transformers.Dinov2Config(**sizes))
-    images = torch.cat([source[0].image, source[GAP].image]).float() / 255
-    depth, images = torch.cat(near).requires_grad_(), images.requires_grad_()
-    K = cam.to_matrix(source[0].camera).expand(2, 3, 3).clone().requires_grad_()
-    extender = ExtendDepth(depth_unit="m", other_image="other", batched=True, n=N)
-    out = extender({"image": images, "other": images.flip(0), "depth": depth, "intrinsics": K})
-    seen = network(pixel_values=images).last_hidden_state[:, 1:]
-    tokens = torch.cat((seen, out["dhtorch.tokens"]), -1)
-    assert seen.shape == (2, P, 32) and tokens.shape == (2, P, 42)
-    head = torch.nn.Linear(42, 4)
-    head(tokens).square().mean().backward()
-    assert head.weight.grad[:, 32:].abs().max() > 0
-    for name, x in {"depth": depth, "images": images, "K": K}.items():
-        assert x.grad.isfinite().all() and x.grad.abs().max() > 0, name
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in network.encoder.parameters())
-    # What far tokens owe to the intrinsics comes through triangulation alone.
-    K.grad, given = None, images.detach()
-    out = extender({"image": given, "other": given.flip(0), "depth": depth.detach(), "intrinsics": K})
-    recovered = out["dhtorch.source"] == Source.RECOVERED
-    assert recovered.sum() > 20
-    out["dhtorch.depth"][recovered].sum().backward()
-    assert K.grad.abs().max() > 0
-
-
-def test_what_a_validation_does_not_know_is_0_and_marked_as_unknown(sample, monkeypatch):
-    """A number is known with both its bounds; a map that is cut at 0 m is cut."""
-    pixel, number, nan = torch.zeros(3, 1, 2), torch.tensor([[1.0, 0.9, 1.1]]).repeat(3, 1), float("nan")
-    number[1, 2], number[2] = nan, nan
-    fields = {"state": pixel.int(), "view": pixel.int(), "clip_depth": torch.tensor([0.0, 3.0, nan])}
-    fields["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
-    names = ("evidence", "sparse_evidence", "photometric_evidence", "consistency_evidence", "outline_evidence")
-    fields |= {**dict.fromkeys(names, pixel), "cause": pixel.int()}
-    numbers = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
-    verdict = DepthValidation(**fields, **dict.fromkeys(numbers, number))
-    monkeypatch.setattr(validate_depth, "validate_depth", lambda *_, **__: verdict)
-    keys = added(ValidateDepth(depth_unit="mm", batched=True)(default_collate([sample] * 3)))
-    assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
-    for name in ("scale", "shift", "tilt", "wrong"):
-        assert keys[f"{name}_known"].tolist() == [True, False, False] and keys[name].isfinite().all()
-        assert torch.equal(keys[name][0], number[0]) and keys[name][2].tolist() == [0.0] * 3
-    assert keys["clip_depth_known"].tolist() == [True, True, False] and keys["clip_depth"].tolist() == [0.0, 3.0, 0.0]

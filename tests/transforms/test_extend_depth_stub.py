@@ -14,7 +14,7 @@ import dhtorch
 from dhtorch.codes import Gate, Source
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
-from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem, extend_depth, patch_tokens
+from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem
 
 QUIET = {"none": 0, "no_second_view": 0, "no_depth": 0, "unreadable": 0}
 NONE, ALONE, EMPTY, UNREADABLE = range(4)
@@ -52,18 +52,6 @@ def test_every_answer_has_its_place():
         assert mine["xyz"][k].tolist() == pytest.approx([(u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z], abs=1e-6)
 
 
-def test_points_lie_on_bent_rays_where_the_lens_bends_them():
-    bend = [0.05, -0.02, 0.01, -0.01]
-    straight = added(tiny()(sample()))["uv"]
-    for k, point in enumerate(added(tiny(distortion=bend)(sample()))["xyz"][:5].double()):
-        x, y, _ = point / point[2]
-        r2 = x * x + y * y
-        radial = 1 + bend[0] * r2 + bend[1] * r2 * r2
-        u = K[0] * (x * radial + 2 * bend[2] * x * y + bend[3] * (r2 + 2 * x * x)) + K[2]
-        v = K[1] * (y * radial + bend[2] * (r2 + 2 * y * y) + 2 * bend[3] * x * y) + K[3]
-        assert [float(u), float(v)] == pytest.approx(straight[k].tolist(), abs=1e-3)
-
-
 def test_the_pose_is_a_matrix_where_there_is_one():
     fit = pose(1)
     wanted = torch.eye(4)
@@ -73,15 +61,6 @@ def test_the_pose_is_a_matrix_where_there_is_one():
         assert mine["pose_code"] == code and mine["pose_ok"] == ok
         assert torch.equal(mine["T_1_from_0"], wanted * ok), "no NaN"
         assert torch.equal(mine["pose_cov"], torch.arange(36.0).view(6, 6) * ok)
-
-
-@pytest.mark.parametrize("options", [{}, {"tokens_hw": (14, 28)}, {"patch": 5, "tokens_hw": (30, 20), "fit": "pad"}])
-def test_tokens_are_those_of_the_merged_map(options):
-    method, options, trace = FixedEstimate(), {"patch": 7, **options}, {}
-    mine = added(tiny(method, **options)(sample()))
-    estimate = method(method.arguments["reference"], None, trace=trace)
-    tokens, known = patch_tokens(dhtorch.merge(trace["samples"], estimate), trace["samples"].hole, (H, W), **options)
-    assert torch.equal(mine["tokens"], tokens[0]) and torch.equal(mine["tokens_valid"], known[0]) and known.any()
 
 
 def test_the_sample_is_not_changed_and_keys_bear_the_prefix():
@@ -173,25 +152,6 @@ def test_without_a_second_view_the_front_end_runs_alone(alone):
     assert not any(mine[name].any() for name in ("T_1_from_0", "pose_cov", "pose_ok", "pose_code"))
     assert {k: v.dtype for k, v in mine.items()} == {k: v.dtype for k, v in added(tiny()(sample())).items()}
     assert extender.report() == {**QUIET, "no_second_view": 1}
-
-
-def test_the_front_end_has_the_stages_of_the_method():
-    calls = []
-
-    def few(hw, n, *, device, dtype):
-        calls.append((hw, n, dtype))
-        return torch.full((n, 2), 5.0, dtype=dtype).expand(1, n, 2)
-
-    def far(frame, uv):
-        return backproject(frame, uv).replace(sigma=torch.full(uv.shape[:2], 0.125))
-
-    def dark(frame, samples):
-        return samples.replace(hole=samples.hole * 0 + 4)
-
-    method = dhtorch.PAPER.replace(n=3, sample=few, backproject=far, classify=dark, track=None)
-    mine = added(tiny(method, other_image=None)(sample()))
-    assert calls == [((H, W), 3, torch.float32)] and (mine["uv"] == 5).all()
-    assert (mine["sigma"] == 0.125).all() and (mine["hole"] == 4).all()
 
 
 def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
@@ -298,24 +258,6 @@ def test_tokens_of_an_image_that_is_missing_take_the_size_last_seen():
         assert added(tiny(on_error="flag", patch=7, tokens_hw=(21, 7))(lost))["tokens"].shape == (3, 10)
 
 
-def test_a_bad_row_of_a_batch_is_zero_and_the_others_stay():
-    given = batch(4)
-    good = added(tiny(batched=True)(given))
-    given["intrinsics"][2, 0] = 1e-3
-    with pytest.raises(SampleError, match="sample 2 of the batch: intrinsics: focal length"):
-        tiny(batched=True)(given)
-    extender = tiny(batched=True, on_error="flag")
-    with pytest.warns(UserWarning, match="flagged: sample 2 of the batch") as caught:
-        flagged = added(extender(given))
-    assert len(caught) == 1 and flagged["problem"].tolist() == [0, 0, 3, 0]
-    for k, v in flagged.items():
-        assert v.dtype == good[k].dtype and torch.equal(v[[0, 1, 3]], good[k][[0, 1, 3]]), k
-        assert k == "problem" or not v[2].any(), k
-    assert extender.report() == {**QUIET, "none": 3, "unreadable": 1}
-    with pytest.raises(SampleError, match="depth: found no such key"):
-        extender({k: v for k, v in given.items() if k != "depth"})
-
-
 NAMES = r"method is 'mapp', expected one of \['auto', 'fused', 'kornia', 'map', 'paper'\] or a Method"
 
 
@@ -338,34 +280,3 @@ def test_options_that_cannot_be_are_refused(options, message):
 
 
 # ---------------------------------------------------------------------------------------------------- gradients, counts
-
-
-def test_gradients_pass_where_they_are_wanted():
-    def method(a, b, *, n=N, seed=0, trace=None):
-        estimate = FixedEstimate()(a, b, n=n, trace=trace)
-        scaled = estimate.depth.nan_to_num() * a.image.mean() * b.image.mean()
-        return estimate.replace(depth=torch.where(estimate.keep, scaled, torch.nan))
-
-    image = torch.rand(3, H, W, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    extender = tiny(method, other_image="image")
-    extender(sample(image=image))["dhtorch.depth"].sum().backward()
-    assert image.grad.abs().min() > 0
-    with torch.no_grad():
-        assert not extender(sample(image=image))["dhtorch.depth"].requires_grad
-
-
-def test_workers_count_in_rows_of_their_own(monkeypatch):
-    """More workers than rows share some, and none writes into that of the main process."""
-    extender = tiny()
-    extender.tally.add(torch.tensor([0], dtype=torch.int32))
-    for worker in (0, 1, 126, 127):
-        info = type("Info", (), {"id": worker})()
-        monkeypatch.setattr(extend_depth, "get_worker_info", lambda info=info: info)
-        extender.tally.add(torch.tensor([3, 3]))
-    assert extender.report() == {**QUIET, "none": 1, "unreadable": 8}
-    used = extender.tally.counts.sum(1)
-    assert used[0] == 1 and sorted(used[used > 0].tolist()) == [1, 2, 2, 4]
-    twin = copy.deepcopy(extender)
-    twin.tally.add(torch.tensor([2]))
-    assert twin.report() == {**QUIET, "none": 1, "unreadable": 8, "no_depth": 1} and extender.report()["no_depth"] == 0
-    assert extender.tally.counts.is_shared() and twin.tally.counts.is_shared(), "seen by workers that are spawned later"

@@ -12,9 +12,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.image import ImageSize
 from kornia.sensors.camera import BrownConradyModel, PinholeModel
 from support import sample_dicts
-from torch.utils.data import default_collate
 
-from dhtorch.codes import PoseCode, Source
+from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Camera
@@ -268,10 +267,6 @@ def extend(method="map", n=256, **options):
     return ExtendDepth(method=method, n=n, **{"depth_unit": "mm", "other_image": "before", **options})
 
 
-def added(out):
-    return {k: v for k, v in out.items() if k.startswith("dhtorch.")}
-
-
 def test_inside_a_container_it_answers_as_behind_it():
     chain = [K.ColorJiggle(0.05, 0.05, 0.05, 0.05, p=1.0), K.RandomCrop((96, 100), p=1.0)]
     transform = extend()
@@ -298,58 +293,10 @@ def test_inside_a_container_it_answers_as_behind_it():
     assert torch.equal(blurred["dhtorch.depth"], transform(pair())["dhtorch.depth"])
 
 
-def test_each_sample_of_a_batch_has_its_own_parameters():
-    chain = K.AugmentationSequential(
-        K.RandomHorizontalFlip(p=0.5), K.RandomCrop((96, 96), p=1.0), extend(batched=True), data_keys=None
-    )
-    batch = default_collate([pair() for _ in range(4)])
-    torch.manual_seed(2)
-    transform = AugmentSample(chain)
-    out = transform(batch)
-    mirrored = torch.linalg.det(transform.transform_matrix) < 0
-    assert 0 < mirrored.sum() < 4 and len(out["intrinsics"].unique(dim=0)) == 4 and out["dhtorch.pose_ok"].all()
-    for b in range(4):
-        alone = extend()({k: v[b] for k, v in out.items() if not k.startswith("dhtorch.")})
-        assert torch.equal(alone["dhtorch.depth"], out["dhtorch.depth"][b])
-
-
 def test_an_order_drawn_at_random_is_kept():
     chain = K.ImageSequential(K.RandomHorizontalFlip(p=1.0), K.RandomCrop((30, 37), p=1.0), random_apply=1)
     seen = {tuple(augment(chain, sample(), seed=seed)[0]["image"].shape[-2:]) for seed in range(6)}
     assert seen == {(H, W), (30, 37)}
-
-
-@pytest.mark.parametrize("name", ["flip", "crop", "resize", "quarter turn", "colour", "blur"])
-def test_answers_behind_are_answers_before_moved(name):
-    """The same points of the picture, extended before and behind an augmentation, agree within two sigma."""
-    augmentation = {
-        "crop": K.RandomCrop((90, 96), p=1.0),
-        "resize": K.Resize((150, 150), p=1.0),
-        "colour": K.ColorJiggle(0.1, 0.1, 0.1, 0.05, p=1.0),
-        "blur": K.RandomGaussianBlur((3, 3), (0.6, 0.6), p=1.0),
-    }.get(name) or MOVES[name][0]
-    torch.manual_seed(5)
-    move = AugmentSample(augmentation, depth_unit="mm", other_image="before")
-    augmented = move(pair())
-    before = extend()(pair())
-    h, w = augmented["image"].shape[:2]
-    uv = moved_pixels(move.transform_matrix[0], before["dhtorch.uv"]).float()
-    inside = (uv > 1).all(-1) & (uv < torch.tensor([w - 2, h - 2])).all(-1)
-    same_points = extend().method.replace(sample=lambda hw, n, **_: uv[inside], n=int(inside.sum()))
-    behind = extend(same_points, n=None)(augmented)
-    first, second = (x == Source.RECOVERED for x in (before["dhtorch.source"][inside], behind["dhtorch.source"]))
-    both = first & second
-    assert both.sum() > 0.8 * first.sum() > 30 and behind["dhtorch.pose_ok"]
-    d0, s0, d1, s1 = (
-        x[both]
-        for x in (
-            before["dhtorch.depth"][inside],
-            before["dhtorch.sigma"][inside],
-            behind["dhtorch.depth"],
-            behind["dhtorch.sigma"],
-        )
-    )
-    assert ((d1 - d0).abs() <= 2 * (s0**2 + s1**2).sqrt()).float().mean() >= 0.95
 
 
 def test_a_picture_that_moves_without_its_intrinsics_is_no_answer():

@@ -125,18 +125,12 @@ def test_the_same_views_whatever_the_form(row):
     assert found.other is None and found.paired.tolist() == [False] and found.has_returns.tolist() == [True]
 
 
-def test_grey_images_the_type_of_floats_and_pil():
+def test_grey_images_and_pil():
     pil = pytest.importorskip("PIL.Image")
     assert torch.equal(read(sample(image=pil.fromarray(IMAGE))).reference.image, read(sample()).reference.image)
     grey = picture(shape=(H, W, 1))
     for given in (grey, grey.transpose(2, 0, 1), grey[None]):
         assert torch.equal(read(sample(image=given)).reference.image[0, 0], torch.from_numpy(grey[..., 0]))
-    for dtype in (np.float16, np.float32, np.float64):
-        for wanted in (torch.float32, torch.float64):
-            image = (IMAGE / 255).astype(dtype)
-            frame = read(sample(image=image), dtype=wanted).reference
-            assert frame.image.dtype == frame.depth.dtype == frame.camera.f.dtype == wanted
-            assert torch.equal(frame.image[0], torch.from_numpy(image).permute(2, 0, 1).to(wanted))
     for shape in ((3, 5, 3), (1, 5, 3), (3, 5, 1)):  # an axis that could be either is stated
         for layout, (h, w), order in (("hwc", shape[:2], (2, 0, 1)), ("chw", shape[1:], (0, 1, 2))):
             given = sample(image=picture(shape=shape), depth=np.ones((h, w), np.float32), intrinsics=[4, 4, w / 2, 1])
@@ -550,13 +544,9 @@ def test_gradients_and_tangents_pass_through_the_intrinsics():
     leaf = torch.tensor(matrix(*K), requires_grad=True)
     read(sample(intrinsics=leaf)).reference.camera.f.sum().backward()
     assert leaf.grad.sum() == 2
-    views = SampleSpec(depth_unit="m")
-    with torch.inference_mode():
-        views.read(sample())
-    assert not views.read(sample()).reference.camera.f.is_inference(), "a graph could not go through it"
     with forward_ad.dual_level():
         tangent = forward_ad.make_dual(torch.tensor(matrix(*K)), torch.ones(3, 3))
-        assert forward_ad.unpack_dual(views.read(sample(intrinsics=tangent)).reference.camera.f).tangent is not None
+        assert forward_ad.unpack_dual(read(sample(intrinsics=tangent)).reference.camera.f).tangent is not None
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "model", "lens"])

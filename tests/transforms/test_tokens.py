@@ -1,12 +1,11 @@
-"""Tokens against plain loops: which patch a sample falls in, and what is said of the samples there."""
+"""Tokens by hand: which patch a sample falls in, and what a token says of its samples; many: test_stored_answers.py."""
 
-import numpy as np
 import pytest
 import torch
 
 from dhtorch import MergedDepth
-from dhtorch.codes import Hole, Source, names
-from dhtorch.transforms import TOKEN_CHANNELS, patch_tokens, token_grid
+from dhtorch.codes import Hole, Source
+from dhtorch.transforms import patch_tokens, token_grid
 
 
 def drawn(hw, n=300, batch=2, seed=0, dtype=torch.float64):
@@ -19,59 +18,6 @@ def drawn(hw, n=300, batch=2, seed=0, dtype=torch.float64):
     hole = torch.where(source == Source.SENSOR, Hole.NONE, other)
     sigma = depth * (0.02 + 0.2 * torch.rand(batch, n, generator=g, dtype=dtype))
     return MergedDepth(uv, torch.where(source > 0, depth, 0.0), sigma, depth, source), hole
-
-
-def pooled(found, hole, rows, columns, patch, place):
-    """The tokens, one patch and one sample at a time; ``place`` takes a pixel to the network's picture."""
-    tokens = np.zeros((len(found.uv), rows * columns, len(TOKEN_CHANNELS)))
-    known = np.zeros(tokens.shape[:2], bool)
-    for b in range(len(found.uv)):
-        for r in range(rows):
-            for c in range(columns):
-                inverse, noise, classes = [], [], []
-                for k, (u, v) in enumerate(found.uv[b].tolist()):
-                    x, y = place(u + 0.5, v + 0.5)  # from the corner of the picture
-                    if not (c * patch <= x < (c + 1) * patch and r * patch <= y < (r + 1) * patch):
-                        continue
-                    classes.append(int(hole[b, k]))
-                    if found.source[b, k] != Source.NONE:
-                        z = float(found.depth[b, k])
-                        inverse.append(1 / z)
-                        noise.append(float(found.sigma[b, k]) / z**2)  # d(1/z) = dz / z²
-                token = tokens[b, r * columns + c]
-                if inverse:
-                    known[b, r * columns + c] = True
-                    token[0] = np.mean(inverse)
-                    token[1] = np.sqrt(np.mean(np.square(noise)) + np.var(inverse))
-                if classes:
-                    token[2] = len(inverse) / len(classes)
-                    token[3:] = [classes.count(code) / len(classes) for code in names(Hole)]
-    return tokens, known
-
-
-@pytest.mark.parametrize(
-    ("hw", "patch", "seen", "fit", "place"),
-    [
-        ((30, 45), 10, None, "stretch", lambda x, y: (x, y)),
-        ((33, 48), 7, None, "crop", lambda x, y: (x, y)),  # what is left of the size is dropped
-        ((30, 40), 8, (16, 48), "stretch", lambda x, y: (x * 48 / 40, y * 16 / 30)),
-        ((20, 40), 8, (32, 24), "pad", lambda x, y: (x * 0.6, (y - 10) * 0.6 + 16)),
-        ((40, 20), 8, (24, 32), "pad", lambda x, y: ((x - 10) * 0.6 + 16, y * 0.6)),
-        ((20, 40), 8, (32, 24), "crop", lambda x, y: ((x - 20) * 1.6 + 12, y * 1.6)),
-        ((40, 20), 8, (24, 32), "crop", lambda x, y: (x * 1.6, (y - 20) * 1.6 + 12)),
-    ],
-)
-def test_tokens_are_those_of_a_plain_loop(hw, patch, seen, fit, place):
-    found, hole = drawn(hw)
-    tokens, known = patch_tokens(found, hole, hw, patch=patch, tokens_hw=seen, fit=fit)
-    rows, columns = (size // patch for size in (seen or hw))
-    wanted, some = pooled(found, hole, rows, columns, patch, place)
-    assert tokens.shape == (2, rows * columns, 10) and token_grid(hw, patch=patch, tokens_hw=seen) == (rows, columns)
-    assert np.array_equal(known.numpy(), some) and some.any()
-    np.testing.assert_allclose(tokens.numpy(), wanted, rtol=1e-9, atol=1e-12)
-    assert torch.allclose(tokens[..., 3:].sum(-1), (tokens[..., 3:].sum(-1) > 0).double()), "fractions sum to 1"
-    names_of = ("none", "trackable_no_lidar", "low_texture", "too_bright", "too_dark", "highlight", "at_border")
-    assert ("inverse_depth", "sigma", "answered", *(f"hole_{name}" for name in names_of)) == TOKEN_CHANNELS
 
 
 def tokens_of(uv, depth, sigma=0.0, source=1, hole=None, hw=(10, 10)):

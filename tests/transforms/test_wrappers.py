@@ -1,11 +1,8 @@
 """Wrappers of data sets and hooks of other projects: one contract for all, and a table of damaged items for an epoch."""
 
 import copy
-import os
 import pickle
 import re
-import subprocess
-import sys
 import warnings
 from functools import partial
 from itertools import pairwise
@@ -111,25 +108,6 @@ def rlds_frame(items, i):
     return {"observation": seen, "task": {"language_instruction": b"look around"}, "dataset_name": b"room"}
 
 
-class TvTensor(torch.Tensor):
-    """A tensor subclass such as ``tv_tensors.Image``; arithmetic on it must not meet our stages."""
-
-    @classmethod
-    def __torch_function__(cls, func, types, args=(), kwargs=None):
-        if getattr(func, "__name__", "") in ("add", "mul", "gather", "where"):
-            raise AssertionError("arithmetic on a tv_tensor")
-        return super().__torch_function__(func, types, args, kwargs or {})
-
-
-def halve(given):
-    """A resize to half as torchvision's: images by area, masks by nearest; intrinsics stay as they are."""
-    resized = {}
-    for key, mode in {"image": "area", "before": "area", "depth": "nearest-exact"}.items():
-        plain = given[key].as_subclass(torch.Tensor).float()[None]
-        resized[key] = torch.nn.functional.interpolate(plain, (SIDE // 2,) * 2, mode=mode)[0].as_subclass(TvTensor)
-    return {**given, **resized}
-
-
 #: Hook -> what it makes of item GAP with the item GAP places before it, after a round trip through pickle.
 HOOKS = {
     "frames along time": lambda items, _: ExtendedDataset(LeRobot(items, deltas=[-GAP, 0]), wrist(items))[GAP],
@@ -180,26 +158,6 @@ def test_hooks_of_openpi_and_openvla(items):
     wrong["observation"]["depth"] /= 10
     with pytest.raises(SampleError, match=r"median return is 0\.0\d* m .* at least 0\.01 m"):
         ExtendDepth(**keys, depth_unit="m", n=128)(wrong)
-
-
-def test_torchvision_pipeline(items):
-    image, before = (torch.from_numpy(items[k]["image"]).permute(2, 0, 1) / 255 for k in (GAP, 0))
-    mask = torch.from_numpy(items[GAP]["depth"].astype(np.float32))[None]
-    given = {k: x.as_subclass(TvTensor) for k, x in (("image", image), ("before", before), ("depth", mask))}
-    given = {**items[GAP], **given}
-    whole = plain()(given)
-    assert type(whole["image"]) is TvTensor and type(whole["dhtorch.depth"]) is torch.Tensor
-    assert equal(whole, plain()({**items[GAP], "before": items[0]["image"]}))
-    out = plain(intrinsics_hw=(SIDE, SIDE))(halve(given))
-    # The same places of the room, whatever the size of the image: directions of the points agree with the full K.
-    sensed = (out["dhtorch.source"] == Source.SENSOR) & (out["dhtorch.flag"] == 0)
-    K = torch.from_numpy(items[0]["intrinsics"]).double()
-    x = (2 * out["dhtorch.uv"][sensed].double() + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    xyz = out["dhtorch.xyz"][sensed].double()
-    assert sensed.sum() > 20 and torch.allclose(xyz[:, :2] / xyz[:, 2:], x, atol=1e-5)
-    unmoved = plain(method="map", n=1024)
-    assert unmoved(given)["dhtorch.pose_ok"]
-    assert not unmoved(halve(given))["dhtorch.pose_ok"], "K of another size is contradicted"
 
 
 @QUIET
@@ -801,28 +759,3 @@ def test_a_worker_answers_without_a_graph():
     twin = copy.deepcopy(dataset.transform)
     twin(sample())
     assert twin.report()["none"] == 5 and dataset.transform.report()["none"] == 4
-
-
-FORKED = """
-import os, time, cv2, numpy as np
-from dhtorch.transforms import one_thread
-cv2.setNumThreads(2)
-picture, places = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000, 2), np.float32)
-said = set()
-for _ in range(12):  # on a busy machine the threads are not asleep, and waited for, each time
-    cv2.remap(picture, places, None, cv2.INTER_LINEAR)
-    time.sleep(0.2)
-    pid = os.fork()
-    if pid == 0:
-        one_thread()
-        os._exit(cv2.getNumThreads())
-    said.add(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
-print(*said)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
-def test_a_worker_forked_beside_opencvs_threads_does_not_wait_for_them():
-    ended = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=True, timeout=60)
-    assert ended.stdout.strip() == "1"
