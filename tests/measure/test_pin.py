@@ -7,12 +7,10 @@ from functools import cache
 import pytest
 import torch
 
-import dhtorch
 from dhtorch.cli.pin import describe_pin, guide_pin
 from dhtorch.codes import PinReason, PinVerdict
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix
-from dhtorch.geometry.se3 import Pose
 from dhtorch.measure import CameraPin, PinResult, find_change_points
 from dhtorch.pytree import collate
 from dhtorch.synthetic.fixed_camera import ROOM_LIGHTS, LitRoom, hide_behind_arms, photograph_again
@@ -54,17 +52,6 @@ def test_offsets_are_right_to_three_sigma():
     assert bool((error.abs() < 3.5 * sigma).all())
     assert float(error[:, :3].norm(dim=1).max()) < math.radians(0.1) and float(error[:, 3:].norm(dim=1).max()) < 0.004
     assert torch.equal(result.moved, torch.tensor([False, True, True, False]))
-
-
-def test_shift_is_the_median_motion_of_the_scene():
-    depth = room().truth(0)["depth"].double()
-    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
-    uv = torch.stack((u, v), -1).reshape(1, -1, 2).double()
-    camera = room()[0].camera.map(lambda x: x.double())
-    xyz = dhtorch.geometry.camera.unproject(camera, uv, depth.reshape(1, -1))
-    moved = dhtorch.geometry.camera.project(camera, se3.apply(se3.invert(se3.exp(OFFSETS[1:2])), xyz))
-    expected = float((moved - uv).norm(dim=-1).median())
-    assert float(found().shift_px[1]) == pytest.approx(expected, rel=0.15)
 
 
 def test_a_batch_gives_the_results_of_its_pictures():
@@ -157,13 +144,11 @@ def test_a_capture_as_reference_leaves_out_what_moves():
     assert moving.notes and torch.equal(moving.frame.image, room()[0].image)
 
 
-def test_given_intrinsics_replace_the_references_which_are_those_of_the_images_size():
-    K, camera = to_matrix(room()[0].camera), pinned()._live_camera(None, 2, (60, 80))
+def test_given_intrinsics_replace_the_references():
+    K = to_matrix(room()[0].camera)
     assert torch.allclose(pinned().check(room()[1].image, K[0]).offset, found().offset[1:2])
     K[:, :2, :2] *= 1.05
     assert not torch.allclose(pinned().check(room()[1].image, K).offset, found().offset[1:2], atol=1e-3)
-    torch.testing.assert_close(camera.f, room()[0].camera.f.expand(2, 2) / 2)
-    torch.testing.assert_close(camera.c, (room()[0].camera.c.expand(2, 2) + 0.5) / 2 - 0.5)
 
 
 @pytest.mark.parametrize(
@@ -263,17 +248,3 @@ def test_the_guide_says_which_way_back_and_the_line_states_sigmas(offset, metric
     turn, length = math.degrees(math.hypot(*offset[:3])), 1e3 * math.hypot(*offset[3:])
     words = f"not moved, {px:.2f} ± 0.05 px, turned by {turn:.3f} ± 0.010°, displaced "
     assert describe_pin(result).startswith(words + (f"by {length:.1f} ± 0.2 mm" if metric else "along ("))
-
-
-def test_the_guide_brings_a_camera_back():
-    """Following the words: the live camera displaced by what they say stands where the reference stood."""
-    result = found()[2:3]
-    back = se3.invert(result.T_ref_from_live)
-    lines = [line.split() for line in guide_pin(result)]
-    ways = {"right": (0, 1), "left": (0, -1), "down": (1, 1), "up": (1, -1), "forward": (2, 1), "back": (2, -1)}
-    step = torch.zeros(3, dtype=torch.float64)
-    for axis, sign, length in ((*ways[line[1]], float(line[2])) for line in lines if line[-1] == "mm"):
-        step[axis] = sign * length / 1e3
-    assert float((step - back.t[0]).abs().max()) < 0.0021
-    there = se3.compose(se3.exp(OFFSETS[2:3]), Pose(back.R, step[None]))
-    assert float(there.t.norm()) < 0.008
