@@ -531,6 +531,8 @@ def test_disagreement_is_the_median_relative_difference(scene):
     xyz = cam.unproject(frame.camera, torch.stack((u, v), -1)[None].float(), frame.depth[0, v, u][None])[0].double()
     still = se3.identity(2, torch.zeros((), dtype=torch.float64))
     assert float(depth_disagreement(xyz, frame, still).max()) < 1e-6
+    smaller = frame.replace(depth=frame.depth[:, ::2, ::2])
+    assert float(depth_disagreement(xyz, smaller, still).max()) < 0.02, "by the camera of a smaller map"
     longer = frame.replace(depth=1.03 * frame.depth)
     torch.testing.assert_close(depth_disagreement(xyz, longer, still), torch.full((2,), 0.03 / 1.03).double())
     apart = Pose(still.R, torch.tensor([[0.0, 0, 0], [0, 0, -100.0]], dtype=torch.float64))
