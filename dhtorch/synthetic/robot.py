@@ -261,7 +261,12 @@ class _Step:
         since = time - self.moment
         ahead = self.advance * _smooth_ramp((time - _LOOK_S) / _ADVANCE_S)
         T = np.eye(4)
-        T[:3, :3] = _rotation_from_vector(self.turn * since)
+        # Rotation (3, 3) about the axis of ``turn`` (3,) by its length, rad: Rodrigues' formula
+        turn = self.turn * since
+        angle = float(np.linalg.norm(turn))
+        x, y, z = turn / max(angle, 1e-300)
+        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        T[:3, :3] = np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * (K @ K)
         T[:3, 3] = self.drift * since + np.array([0.0, 0.0, ahead])
         return self.middle @ T
 
@@ -352,11 +357,3 @@ def _rotation_from_angles(yaw: float, pitch: float, roll: float) -> np.ndarray:
     about_x = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
     about_z = np.array([[math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1]])
     return about_y @ about_x @ about_z
-
-
-def _rotation_from_vector(turn: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) about the axis of ``turn`` (3,) by its length, rad: Rodrigues' formula."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn / max(angle, 1e-300)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * (K @ K)

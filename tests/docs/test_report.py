@@ -40,14 +40,14 @@ from dhtorch.viz.plots.markup import Markup, escape_html, make_tag
 
 REPO = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("report_tables.json")
-NAMES = [make.__name__ for make in archived.ALL]
+NAMES = archived.NAMES
 EXPERIMENTS = sorted(p.stem for p in (REPO / "conf" / "experiment").glob("*.yaml"))
 
 
 @functools.cache
 def results():
     """One result of every kind; nobody changes them."""
-    return {make.__name__: make() for make in archived.ALL}
+    return {name: archived.make(name) for name in archived.NAMES}
 
 
 @functools.cache
@@ -178,7 +178,7 @@ def test_what_was_not_measured_says_why():
 
 
 def test_the_knee_stands_in_the_table_and_in_the_figures():
-    result = archived.calibration()
+    result = archived.make("calibration")
     numbers = {"": (0.65, 0.13), "at_0.1.": (0.55, 0.10), "at_0.3.": (0.40, 0.05), "at_0.5.": (0.10, 0.045)}
     for prefix, values in numbers.items():
         for metric, value in zip(("coverage", "median_rel"), values, strict=True):
@@ -342,7 +342,7 @@ def test_figures_are_those_that_the_numbers_allow(name, titles):
 
 def test_scenes_that_a_figure_lacks_are_named_and_a_mean_over_few_answers_is_not_drawn():
     assert "terrace/CAMERA_01 (too short)" in figures._risk(results()["range_split"]).caption
-    result = archived.pair()
+    result = archived.make("pair")
     for row in scene_rows(result):
         row["n_candidates"] = 100
         row["curves"]["risk_coverage"]["coverage"] = [0.02 * k for k in range(1, 21)]  # 2, 4, … 40 answers

@@ -64,7 +64,7 @@ def cases(folder):
     evidence = np.where(state == State.CANNOT_KNOW, np.nan, np.linspace(-8, 8, HW[1])[None])
     curves = {"map": curve(30, 1), "paper": curve(40, 2), "few": curve(5, 2)}
     no, file = np.zeros(0), folder / "a.png"
-    swept = [archived.pair(), archived.pair()]
+    swept = [archived.make("pair"), archived.make("pair")]
     swept[1] = {**swept[1], "config": {**swept[1]["config"], "seed": 20}}
     named = [{**r, "config": {**r["config"], "seed": s}} for r, s in zip(swept, ("a $x$ b", "c$"), strict=True)]
     episodes = [{"cameras": {"front": {"over_time": np.eye(6)[:3].tolist()}}}] * 2
