@@ -26,7 +26,7 @@ import loader
 import pair as pairs
 import torch
 
-from dhtorch.cli import complete, completed_folder, process_capture
+from dhtorch.cli import complete, process_capture
 from dhtorch.cli import run as command
 from dhtorch.data.recording import Recording
 from dhtorch.export import encode_png
@@ -48,7 +48,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "columns": [(extend_depth.ExtendDepth, "_extend")],
     "read frames": [(Recording, "__getitem__")],
     "check the capture": [(process_capture, "check_capture")],
-    "digests": [(completed_folder, "build_shared_metadata"), (completed_folder, "digest_scene_files")],
+    "digests": [(complete, "build_shared_metadata"), (complete, "digest_scene_files")],
     "choose views": [(multiview, "_select_views")],
     "sample and classify": [(pair, "estimate_pair"), (multiview, "estimate_multiview")],
     "track": [(pair, "track_in_chunks")],

@@ -20,8 +20,7 @@ from torch import Tensor
 from dhtorch.alignment import align
 from dhtorch.alignment.map_family import MAP_FAMILIES
 from dhtorch.cli import complete
-from dhtorch.cli import completed_folder as completed
-from dhtorch.cli.completed_folder import CompletionTask, Row, select_layout
+from dhtorch.cli.complete import CompletionTask, Row, select_layout
 from dhtorch.cli.option_checks import validate_choices
 from dhtorch.cli.validate import list_exceeded_limits, parse_limits
 from dhtorch.data import depth_maps
@@ -106,7 +105,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     scene, out = scenes[0], Path(str(settings["out"])).expanduser()
     maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
     task = _make_alignment_task(scene, maps, parts["method"], settings, out)
-    with completed.open_task_folder(task, ("align.json", "align.html")):
+    with complete.open_task_folder(task, ("align.json", "align.html")):
         # Align the missing maps of a task, write and print the summary; returns the exit code
         scene, out = task.scene, task.folder
         n_untouched = sum(task.name(i) in task.done for i in task.frames)
@@ -146,8 +145,8 @@ def _make_alignment_task(
     assert first is not None
     layout = select_layout(recording, settings["format"], settings["unit"], same=first.shape[-2:] == hw)
     more: dict[str, Path | str] = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
-    digest = completed.digest_scene_files(scene, settings, out, more | {"depth unit": f"{maps.unit.metres} m"})
-    options = {**settings, **dict.fromkeys(completed.EXTRA_FILES, False)}
+    digest = complete.digest_scene_files(scene, settings, out, more | {"depth unit": f"{maps.unit.metres} m"})
+    options = {**settings, **dict.fromkeys(complete.EXTRA_FILES, False)}
     return CompletionTask(
         scene=scene,
         folder=out,
@@ -156,7 +155,7 @@ def _make_alignment_task(
         settings=options,
         frames=frames,
         offers={},
-        shared=completed.build_shared_metadata(
+        shared=complete.build_shared_metadata(
             scene, layout, settings, digest, keyed=_KEY_OPTIONS, roots=_CODE_ROOTS, calibration=None, word="align"
         ),
     )
@@ -288,7 +287,7 @@ def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exc
         cells = ["–" if x is None else f"{x:.3f}" if isinstance(x, float) else str(x) for x in values]
         image = None
         if i in shown:  # the figure of a frame, from its written files
-            out, aligned = io.BytesIO(), completed.read_completed_maps(task, i)[0]
+            out, aligned = io.BytesIO(), complete.read_completed_maps(task, i)[0]
             title = f"{task.scene.name} {task.name(i)}"
             draw_aligned(out, task.recording[i].image[0], maps[i], **aligned, title=title)
             image = out.getvalue()

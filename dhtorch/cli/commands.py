@@ -32,12 +32,12 @@ class Command:
     text: str
     examples: tuple[tuple[str, str], ...]  # (arguments, effect)
     options: tuple[str, ...]  # names shown by --help
-    config: str = ""  # file of conf/ with the options; empty: the command's own name
+    config: str = ""  # file of conf/ whose options the command has as well
     exit_line: str = _EXIT_LINE
     words: str = ""  # what is typed; empty: the command's own name
 
 
-class OptionNote(NamedTuple):
+class _OptionNote(NamedTuple):
     """Default value and description of an option, as its settings file has them."""
 
     default: str
@@ -423,74 +423,47 @@ COMMANDS: dict[str, Command] = {
 
 #: Option that no settings file describes → its default and description.
 _SHARED_NOTES = {
-    "quiet": OptionNote("", "-q: print only results and errors; -v also logs inputs and steps"),
-    "data": OptionNote("", "a reader or a built-in scene: auto, synthetic, tum, … (see --help-all)"),
-    "method": OptionNote("", "paper, map, auto or fused, see docs/methods.md"),
-    "pairs": OptionNote("", "source views: auto (selected by the method), gap, time or baseline"),
-    "holdout": OptionNote("", "range (returns beyond the cutoff are hidden) or none"),
-    "experiment": OptionNote("", "pair, range_split, ablation, method_comparison, … (see --help-all)"),
-    "launch": OptionNote("", "jobs of a sweep: basic (one by one), joblib, ray, submitit_local, submitit_slurm"),
-    "holdout.cutoff": OptionNote("null", "m; returns beyond it are hidden and serve as ground truth"),
-    "pairs.gap": OptionNote("null", "frames between the two of a pair (pairs=gap)"),
-}
-
-#: Commands with their own argument parser: option → default and description.
-_PARSER_NOTES = {
-    "inspect": {
-        "out": OptionNote("outputs/DATE/TIME", "folder of the contact sheet"),
-        "format": OptionNote("auto", "name of the format; auto = recognised from the content"),
-        "max_frames": OptionNote("8", "number of frames to decode and show"),
-        "traceback": OptionNote("false", "show the traceback of an error"),
-    },
-    "fetch": {
-        "out": OptionNote("null", "folder of the scenes; null = DHTORCH_DATA, else dhtorch_data"),
-        "yes": OptionNote("false", "accept the printed licences"),
-        "table": OptionNote("null", "FILE.json: another table of addresses, as of a mirror"),
-        "traceback": OptionNote("false", "show the traceback of an error"),
-    },
-    "report": {
-        "html": OptionNote("null", "FILE.html: write one page with tables and figures instead"),
-        "markdown": OptionNote("false", "print Markdown instead of console tables"),
-        "traceback": OptionNote("false", "show the traceback of an error"),
-    },
-}
-
-#: Options of the demo beside those of ``dhtorch PATH``.
-_DEMO_NOTES = {
-    "out": OptionNote("dhtorch_out/demo", "folder of the capture and of its result"),
-    "browser": OptionNote("true", "open the page in a browser where there is a screen"),
+    "quiet": _OptionNote("", "-q: print only results and errors; -v also logs inputs and steps"),
+    "data": _OptionNote("", "a reader or a built-in scene: auto, synthetic, tum, … (see --help-all)"),
+    "method": _OptionNote("", "paper, map, auto or fused, see docs/methods.md"),
+    "pairs": _OptionNote("", "source views: auto (selected by the method), gap, time or baseline"),
+    "holdout": _OptionNote("", "range (returns beyond the cutoff are hidden) or none"),
+    "experiment": _OptionNote("", "pair, range_split, ablation, method_comparison, … (see --help-all)"),
+    "launch": _OptionNote("", "jobs of a sweep: basic (one by one), joblib, ray, submitit_local, submitit_slurm"),
+    "holdout.cutoff": _OptionNote("null", "m; returns beyond it are hidden and serve as ground truth"),
+    "pairs.gap": _OptionNote("null", "frames between the two of a pair (pairs=gap)"),
 }
 
 #: Options of readers, of which every command that reads a capture has ``--NAME`` beside ``data.NAME=VALUE``.
 READER_NOTES = {
-    "fov": OptionNote("null", "horizontal field of view, degrees, of a capture without intrinsics"),
-    "K": OptionNote("null", "fx,fy,cx,cy, px, of a capture without intrinsics"),
-    "intrinsics": OptionNote("null", "a feature's name, fx,fy,cx,cy or the horizontal field of view"),
-    "depth_unit": OptionNote("null", "m, cm, mm, inch or metres of one step; null = as stated, else assumed"),
-    "depth_lag": OptionNote("null", "frames by which the depth comes late"),
-    "depth_turn": OptionNote("null", "rotation of the depth: 90, 180, 270, left_right, upside_down"),
-    "pose_convention": OptionNote("null", "of the stated poses: opengl, world_to_camera, wxyz, mm, joined by +"),
-    "camera": OptionNote("null", "of several: one or a list"),
-    "episode": OptionNote("null", "of several: one or a list"),
-    "follow_links": OptionNote("false", "follow links that lead out of the capture"),
+    "fov": _OptionNote("null", "horizontal field of view, degrees, of a capture without intrinsics"),
+    "K": _OptionNote("null", "fx,fy,cx,cy, px, of a capture without intrinsics"),
+    "intrinsics": _OptionNote("null", "a feature's name, fx,fy,cx,cy or the horizontal field of view"),
+    "depth_unit": _OptionNote("null", "m, cm, mm, inch or metres of one step; null = as stated, else assumed"),
+    "depth_lag": _OptionNote("null", "frames by which the depth comes late"),
+    "depth_turn": _OptionNote("null", "rotation of the depth: 90, 180, 270, left_right, upside_down"),
+    "pose_convention": _OptionNote("null", "of the stated poses: opengl, world_to_camera, wxyz, mm, joined by +"),
+    "camera": _OptionNote("null", "of several: one or a list"),
+    "episode": _OptionNote("null", "of several: one or a list"),
+    "follow_links": _OptionNote("false", "follow links that lead out of the capture"),
 }
 
 #: Short name → dotted name, in commands with that group.
 _SHORT_NAMES = {"run": {"cutoff": "holdout.cutoff", "gap": "pairs.gap", "out": "output"}}
 
-_OPTION_LINE = re.compile(r"(?P<indent> *)(?P<name>\w+):(?P<default>.*?)(?: +# (?P<note>.*))?$")
+_OPTION_LINE = re.compile(r"(?P<indent> *)\"?(?P<name>\w+)\"?:(?P<default>.*?)(?: +# (?P<note>.*))?$")
 
 
-def read_option_notes(file: Path) -> dict[str, OptionNote]:
+def read_option_notes(file: Path) -> dict[str, _OptionNote]:
     """Options of a settings file with their defaults and comments; those below a node have dotted names.
 
     Groups are taken from the list of defaults.
     """
-    notes: dict[str, OptionNote] = {}
+    notes: dict[str, _OptionNote] = {}
     node = ""
     for line in file.read_text(encoding="utf-8").splitlines():
         if match := re.match(r"  - (\w+): (\w+)", line):
-            notes[match[1]] = OptionNote(match[2], _SHARED_NOTES.get(match[1], OptionNote("", "")).note)
+            notes[match[1]] = _OptionNote(match[2], _SHARED_NOTES.get(match[1], _OptionNote("", "")).note)
             continue
         match = _OPTION_LINE.match(line)
         if not match or match["name"] in ("defaults", "_target_"):
@@ -500,26 +473,25 @@ def read_option_notes(file: Path) -> dict[str, OptionNote]:
         if not match["indent"]:
             node = "" if match["default"].strip() else f"{match['name']}."
         name = f"{node}{match['name']}" if match["indent"] else match["name"]
-        notes[name] = OptionNote(match["default"].strip(), match["note"] or "")
+        notes[name] = _OptionNote(match["default"].strip(), match["note"] or "")
     return notes
 
 
-def list_options(name: str, conf: Path) -> dict[str, OptionNote]:
+def list_options(name: str, conf: Path) -> dict[str, _OptionNote]:
     """All options of a command by dotted name, those of readers as ``data.NAME``."""
-    if name in _PARSER_NOTES:
-        own = dict(_PARSER_NOTES[name])
-    else:
-        own = read_option_notes(conf / f"{COMMANDS[name].config or name}.yaml")
+    own = {
+        k: note
+        for file in filter(None, (COMMANDS[name].config, name))
+        for k, note in read_option_notes(conf / f"{file}.yaml").items()
+    }
     if name == "run":
         own |= {k: _SHARED_NOTES[k] for k in ("holdout.cutoff", "pairs.gap")}
-    if name == "demo":
-        return _DEMO_NOTES | {k: note for k, note in own.items() if k not in _DEMO_NOTES and k != "path"}
-    if name in ("report", "fetch"):
+    if name in ("report", "fetch", "demo"):
         return own
     return {**{f"data.{option}": note for option, note in READER_NOTES.items()}, **own}
 
 
-def resolve_option(name: str, option: str, known: Mapping[str, OptionNote]) -> str | None:
+def _resolve_option(name: str, option: str, known: Mapping[str, _OptionNote]) -> str | None:
     """Dotted name of an option that is typed without the node above it; None where the command has no such option."""
     plain = option.replace("-", "_")
     plain = _SHORT_NAMES.get(name, {}).get(plain, plain)
@@ -562,15 +534,15 @@ def format_command_help(name: str, conf: Path) -> str:
     lines += [f"  {f'{typed} {arguments}'.rstrip():<{width}}{effect}" for arguments, effect in command.examples]
     lines += ["", "Options, with their defaults:"]
     for option in command.options:
-        full = resolve_option(name, option, known)
+        full = _resolve_option(name, option, known)
         assert full is not None, (name, option)
         lines += _format_option(option, known[full])
     lines += _format_option("quiet", _SHARED_NOTES["quiet"])
-    more = [] if name in _PARSER_NOTES else ["--help-all: every option. --cfg job: the settings as composed."]
-    return "\n".join([*lines, "", *more, command.exit_line])
+    more = "--help-all: every option. --cfg job: the settings as composed."
+    return "\n".join([*lines, "", more, command.exit_line])
 
 
-def _format_option(option: str, note: OptionNote) -> list[str]:
+def _format_option(option: str, note: _OptionNote) -> list[str]:
     """Lines of one option: name, default, description."""
     default = {"???": "(required)", "null": "-"}.get(note.default, note.default)
     default = "outputs/DATE/TIME" if "${now" in default else default
@@ -591,7 +563,7 @@ HYDRA_VALUE_FLAGS |= {long: long for long in HYDRA_VALUE_FLAGS.values()}
 
 
 def to_overrides(
-    name: str, argv: Sequence[str], known: Mapping[str, OptionNote], flags: Iterable[str], suggest: Suggest
+    name: str, argv: Sequence[str], known: Mapping[str, _OptionNote], flags: Iterable[str], suggest: Suggest
 ) -> list[str]:
     """``--option value``, ``--option=value``, ``--switch`` and ``--no-switch`` -> ``option=value``; the rest unchanged.
 
@@ -609,54 +581,34 @@ def to_overrides(
     while words:
         word = words.pop(0)
         flag, sign, value = word.partition("=")
-        if flag in flags or not flag.startswith("--") or flag == "--":
-            has_value = word in HYDRA_VALUE_FLAGS and words and words[0][:1] != "-" and "=" not in words[0]
-            out.append(f"{HYDRA_VALUE_FLAGS[word]}={words.pop(0)}" if has_value else word)
-            continue
-        option = flag.removeprefix("--")
-        full = option if "." in option else resolve_option(name, option, known)
-        if full is None and option.startswith("no-") and not sign:
-            full, value = resolve_option(name, option.removeprefix("no-"), known), "false"
-            sign = "=" if full is not None and known[full].is_switch else ""
-            full = full if sign else None
-        if full is None:
-            names = [each.rpartition(".")[2].replace("_", "-") for each in known]
-            near = suggest(option, [*(each[2:] for each in flags if each.startswith("--")), *names])
-            near = near.replace("mean ", "mean --")
-            expected = ", ".join(["one listed by --help", *sorted(each for each in flags if each.startswith("--"))])
-            raise ValueError(f"{flag}: found an unknown option{near}, expected {expected}")
-        if not sign:
-            is_switch = full in known and known[full].is_switch
-            is_value = bool(words) and not words[0].startswith("--")
-            has_value = is_value and (not is_switch or words[0] in _SWITCH_VALUES or words[0].startswith("{"))
-            if not has_value and not is_switch:
-                raise ValueError(f"{flag}: found no value, expected {flag} VALUE")
-            value = words.pop(0) if has_value else "true"
-        out.append(f"{full}={value}")
-    for k, word in enumerate(out):
-        # ``option=value`` with the option's dotted name, and in brackets where the default is a list
-        option, sign, value = word.partition("=")
-        is_name = bool(sign) and re.fullmatch(r"\w[\w.-]*", option) is not None
-        if is_name and (full := resolve_option(name, option, known)) is not None:
-            default, note = known[full]
-            is_list = default.startswith("[") or note.startswith("list ")
-            out[k] = f"{full}=[{value}]" if is_list and not value.startswith(("[", "null")) else f"{full}={value}"
+        full = None
+        if flag.startswith("--") and flag != "--" and flag not in flags:
+            option = flag.removeprefix("--")
+            full = option if "." in option else _resolve_option(name, option, known)
+            if full is None and option.startswith("no-") and not sign:
+                full, value = _resolve_option(name, option.removeprefix("no-"), known), "false"
+                sign = "=" if full is not None and known[full].is_switch else ""
+                full = full if sign else None
+            if full is None:
+                names = [each.rpartition(".")[2].replace("_", "-") for each in known]
+                long_flags = sorted(each for each in flags if each.startswith("--"))
+                near = suggest(option, [*(each[2:] for each in long_flags), *names]).replace("mean ", "mean --")
+                expected = ", ".join(["one listed by --help", *long_flags])
+                raise ValueError(f"{flag}: found an unknown option{near}, expected {expected}")
+            if not sign:
+                is_switch = full in known and known[full].is_switch
+                is_value = bool(words) and not words[0].startswith("--")
+                has_value = is_value and (not is_switch or words[0] in _SWITCH_VALUES or words[0].startswith("{"))
+                if not has_value and not is_switch:
+                    raise ValueError(f"{flag}: found no value, expected {flag} VALUE")
+                value = words.pop(0) if has_value else "true"
+        elif word in HYDRA_VALUE_FLAGS and words and words[0][:1] != "-" and "=" not in words[0]:
+            word = f"{HYDRA_VALUE_FLAGS[word]}={words.pop(0)}"
+        elif sign and re.fullmatch(r"\w[\w.-]*", flag):
+            full = _resolve_option(name, flag, known)
+        # With the option's dotted name, and in brackets where the default is a list
+        default, note = known.get(full or "", _OptionNote("", ""))
+        is_list = default.startswith("[") or note.startswith("list ")
+        value = f"[{value}]" if is_list and not value.startswith(("[", "null")) else value
+        out.append(word if full is None else f"{full}={value}")
     return out
-
-
-def to_parser_arguments(argv: Iterable[str], known: Iterable[str]) -> list[str]:
-    """``option=value`` -> ``--option=value`` for commands with their own argument parser; reader options,
-    ``data.NAME=VALUE``, stay and come last."""
-    out: list[str] = []
-    reader_options: list[str] = []
-    for word in argv:
-        option, sign, value = word.partition("=")
-        if sign and option.startswith("data."):
-            reader_options.append(word)
-        elif not sign or option not in known:
-            out.append(word)
-        elif value in ("true", "false"):
-            out += [f"--{option.replace('_', '-')}"] * (value == "true")
-        else:
-            out.append(f"--{option.replace('_', '-')}={value}")
-    return [*out, *reader_options]

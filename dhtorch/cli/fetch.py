@@ -7,7 +7,6 @@ first. An interrupted download goes on where it stopped; nothing gets its name b
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import hashlib
 import http.client
@@ -25,6 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from dhtorch.cli.option_checks import validate_choices
 from dhtorch.runtime import console, storage
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, open_output_folder
 
@@ -45,7 +45,7 @@ _TIMEOUT_S = 60
 
 
 @dataclass(frozen=True)
-class FetchedScene:
+class _FetchedScene:
     """A scene of the table."""
 
     folder: str
@@ -60,14 +60,14 @@ class FetchedScene:
     texts: Mapping[str, str] = field(default_factory=dict)  # name → content of files that are ours
 
 
-def read_fetch_table(path: Path) -> list[FetchedScene]:
+def read_fetch_table(path: Path) -> list[_FetchedScene]:
     """Scenes of a table.
 
     Raises:
         ValueError: no table, a name that leads out of the folder, or an address that is neither http nor https.
     """
     try:
-        scenes = [FetchedScene(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["scenes"]]
+        scenes = [_FetchedScene(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["scenes"]]
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(
             f"{path}: found no table of scenes ({error}), expected one as {path.name} of dhtorch"
@@ -82,37 +82,32 @@ def read_fetch_table(path: Path) -> list[FetchedScene]:
     return scenes
 
 
-def main(argv: Sequence[str]) -> int:
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any) -> int:
     """Run ``dhtorch fetch SET``: 0 if all files are there, 2 if the licences were not accepted.
 
     Raises:
         ValueError, OSError: a bad table, no answer of a server, a wrong digest, a folder that cannot be written.
     """
-    parser = argparse.ArgumentParser(prog="dhtorch fetch", epilog=console.HELP_EPILOG)
-    parser.add_argument("set", choices=sorted(FETCHED_SETS))
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--table", type=Path)
-    parser.add_argument("--yes", action="store_true")
-    parser.add_argument("--traceback", action="store_true")
-    options = parser.parse_args(argv)
-    scenes = read_fetch_table(options.table or FETCHED_SETS[options.set])
-    out = (options.out or Path(os.environ.get("DHTORCH_DATA") or "dhtorch_data")).expanduser()
+    validate_choices(settings, {"set": FETCHED_SETS})
+    scenes = read_fetch_table(Path(settings["table"] or FETCHED_SETS[settings["set"]]))
+    out = Path(settings["out"] or os.environ.get("DHTORCH_DATA") or "dhtorch_data").expanduser()
     for scene in scenes:
         digest = "" if not scene.archive or scene.archive_sha256 else "; digest of the archive unknown, files checked"
         print(f"{scene.folder}: {scene.licence}; {scene.source}{digest}")
-    if not options.yes and not (
+    if not settings["yes"] and not (
         sys.stdin.isatty() and input("Accept these licences? [y/N] ").strip().lower() in ("y", "yes")
     ):
         print("dhtorch: licences not accepted, nothing fetched; --yes accepts them", file=sys.stderr)
         return 2
     n = fetch_scenes(scenes, out)
     print(
-        f"{console.format_count(n, 'file')} fetched into {out}; for data={options.set} set DHTORCH_DATA={out.resolve()}"
+        f"{console.format_count(n, 'file')} fetched into {out}; "
+        f"for data={settings['set']} set DHTORCH_DATA={out.resolve()}"
     )
     return 0
 
 
-def fetch_scenes(scenes: Sequence[FetchedScene], out: Path, *, max_bytes: int = MAX_BYTES) -> int:
+def fetch_scenes(scenes: Sequence[_FetchedScene], out: Path, *, max_bytes: int = MAX_BYTES) -> int:
     """Download the files of all scenes that ``out`` lacks → their number.
 
     Raises:
@@ -134,7 +129,7 @@ def fetch_scenes(scenes: Sequence[FetchedScene], out: Path, *, max_bytes: int = 
     return n
 
 
-def _contents(scene: FetchedScene, names: Sequence[str], parts: Path, max_bytes: int) -> Iterator[tuple[str, bytes]]:
+def _contents(scene: _FetchedScene, names: Sequence[str], parts: Path, max_bytes: int) -> Iterator[tuple[str, bytes]]:
     """(name, checked content) of the files of a scene, one after another."""
     if not scene.archive:
         for name in console.progress(names, scene.folder, len(names)):
@@ -156,7 +151,7 @@ def _contents(scene: FetchedScene, names: Sequence[str], parts: Path, max_bytes:
         file.unlink()
 
 
-def _finish(scene: FetchedScene, name: str, content: bytes, where: str) -> bytes:
+def _finish(scene: _FetchedScene, name: str, content: bytes, where: str) -> bytes:
     """Content of a file, cut to its rows, with the right digest."""
     cut, lines = scene.cut.get(name, {}), content.splitlines(keepends=True)
     if "rows" in cut:  # first and last, from 0

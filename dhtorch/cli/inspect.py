@@ -6,15 +6,12 @@ of no known format.
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import inspect
 import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -45,12 +42,12 @@ from dhtorch.experiments.focal.image_folder import list_camera_files
 from dhtorch.geometry.sensor_noise import sensor_of_format
 from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.runtime import safe_open as doors
-from dhtorch.runtime import storage
-from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
+from dhtorch.runtime.console import escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation.capture_check import check_capture
-from dhtorch.viz.plots import format_capture_name
-from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
+from dhtorch.viz.plots import format_capture_name, make_image_grid, save_figure
+from dhtorch.viz.plots.colours import DEPTH_CMAP, SCORE_CMAP
+from dhtorch.viz.plots.maps import Scale, to_unit_rgb
 
 _MAX_LEVELS = 2  # levels of folders searched below the path
 _MAX_RECORDINGS = 12  # recordings shown of one capture
@@ -58,9 +55,6 @@ _NO_INTRINSICS_MESSAGE = (
     "no intrinsics: depth cannot be computed without them; set data.K=[fx,fy,cx,cy] or data.fov=DEGREES"
 )
 _ASSUMED_FOV_DEG = 60.0  # horizontal field of view assumed for a capture without intrinsics, degrees
-_TILE_GAP = 0.02  # margin around a tile of the contact sheet, in widths of its cell
-_ROW_LABELS = {"image": "Picture", "depth": "Depth", "conf": "Confidence\n0 dark, 2 bright"}
-_BESIDE_TILES = {"textcoords": "offset points", "fontsize": 7, "color": INK, "ha": "right", "va": "center"}
 _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are drawn larger
 _CAPTURE_SUFFIXES = (  # of files that may be a whole capture
     (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
@@ -80,50 +74,33 @@ class FoundCapture:
     options: Mapping[str, Any] = field(default_factory=dict)  # of the reader
 
 
-def main(argv: Sequence[str]) -> int:
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any) -> int:
     """``dhtorch inspect PATH``: print the content of a capture, write a contact sheet.
 
     Raises:
         FormatError: no file, or no capture.
         KeyboardInterrupt: Ctrl-C; written contact sheets are kept.
     """
-    parser = argparse.ArgumentParser(
-        prog="dhtorch inspect",
-        description="Print the content of a capture and write a contact sheet.",
-        epilog=HELP_EPILOG,
-    )
-    parser.add_argument("path", type=Path, help="a capture: a file, its folder, or up to two folders above it")
-    options_help = "reader option as data.NAME=VALUE: data.fov=69, data.K=[600,600,320,240], data.camera=[a,b]"
-    parser.add_argument("options", nargs="*", default=[], metavar="data.NAME=VALUE", help=options_help)
-    parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
-    parser.add_argument("--format", default="auto", help="name of the format (default: recognised from the content)")
-    parser.add_argument("--max-frames", type=int, default=8, help="number of frames to decode and show (default: 8)")
-    parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
-    options = parser.parse_intermixed_args(argv)
-    if options.max_frames < 1:
-        raise ValueError(f"--max-frames: found {options.max_frames}, expected at least 1")
-    reader_options = _parse_reader_options(options.options)
+    root, out, format = Path(str(settings["path"])).expanduser(), Path(settings["output"]), settings["format"]
+    reader_options = {name: value for name, value in settings["data"].items() if value is not None}
     links = reader_options.pop("follow_links", False)
-    if not isinstance(links, bool):
-        raise ValueError(f"data.follow_links: found {links!r}, expected true or false")
-    if options.format == "auto":
-        captures = find_captures(options.path, links)
-    elif options.format in data.FORMATS or options.format in formats.STACK_FORMATS:
-        kind = "stacks" if options.format in formats.STACK_FORMATS else "recording"
-        captures = [FoundCapture(options.path, kind, options.format, "format= given")]
+    if format == "auto":
+        captures = find_captures(root, links)
+    elif format in data.FORMATS or format in formats.STACK_FORMATS:
+        kind = "stacks" if format in formats.STACK_FORMATS else "recording"
+        captures = [FoundCapture(root, kind, format, "format= given")]
     else:
         known = ", ".join(("auto", *data.FORMATS, *formats.STACK_FORMATS))
-        raise FormatError(options.path, "format", options.format, known)
+        raise FormatError(root, "format", format, known)
     captures = [replace(capture, follow_links=links, options=reader_options) for capture in captures]
-    now = datetime.now()
-    out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S-%f}"
-    root, sheets = options.path, list[Path]()
-    with open_output_folder(out, "--out"):
+    sheets = list[Path]()
+    with open_output_folder(out, "output"):
         try:
             for capture in captures:
-                for survey in survey_capture(capture, options.max_frames):
-                    parts = capture.path.relative_to(root).parts
-                    survey.name = "/".join((root.resolve().name, *parts[:-1], survey.name)) if parts else survey.name
+                for survey in survey_capture(capture, settings["max_frames"]):
+                    parts_below = capture.path.relative_to(root).parts
+                    if parts_below:
+                        survey.name = "/".join((root.resolve().name, *parts_below[:-1], survey.name))
                     print_survey(capture, survey)
                     sheets.append(write_contact_sheet(survey, out))
                     print(f"wrote {sheets[-1]}\n")
@@ -218,32 +195,11 @@ def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
                 survey.warn(f"not a recording: {', '.join(f'data.{name}' for name in capture.options)} not used")
             yield survey
     except FormatError as error:
-        if capture.options or not capture.path.is_dir() or not any(classify_images(capture.path)):
+        if capture.options or not capture.path.is_dir() or not any(_classify_images(capture.path)):
             raise
         survey = _survey_loose_pictures(capture, frames)
         survey.warnings.insert(0, f"the {capture.format} reader rejects it: {error}")
         yield survey
-
-
-def _parse_reader_options(arguments: Sequence[str]) -> dict[str, Any]:
-    """Arguments ``data.NAME=VALUE`` -> reader options; a list is written a,b or [a,b].
-
-    Raises:
-        ValueError: another argument.
-    """
-    options: dict[str, Any] = {}
-    for argument in arguments:
-        name, sign, text = argument.partition("=")
-        if not (sign and name.startswith("data.") and name.removeprefix("data.").isidentifier()):
-            raise ValueError(f"{argument}: found an unknown argument, expected data.NAME=VALUE, e.g. data.fov=69")
-        items: list[Any] = [item.strip() for item in text.removeprefix("[").removesuffix("]").split(",")]
-        for k, item in enumerate(items):
-            items[k] = {"true": True, "false": False, "null": None}.get(item.lower(), item)
-            for kind in (float, int):
-                with contextlib.suppress(ValueError):
-                    items[k] = kind(item)
-        options[name.removeprefix("data.")] = items if text.startswith("[") or len(items) > 1 else items[0]
-    return options
 
 
 # -------------------------------------------------------------------------------------------------------------- search
@@ -262,7 +218,7 @@ def _recognise_all(candidates: Sequence[Path], readers: Mapping[str, Any], follo
 
 def describe_pictures(path: Path, captures: Sequence[FoundCapture]) -> str:
     """Why images of no known format, found below ``path``, give no depth, and what is required instead."""
-    lists = [classify_images(capture.path) for capture in captures]
+    lists = [_classify_images(capture.path) for capture in captures]
     n_pictures, n_depths = (sum(len(each[k]) for each in lists) for k in (0, 1))
     pictures, depths = format_count(n_pictures, "picture"), format_count(n_depths, "depth map")
     if not n_pictures + n_depths:
@@ -325,7 +281,7 @@ def _open_recordings(capture: FoundCapture, warning: list[str]) -> Sequence[Reco
     return recordings
 
 
-def classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
+def _classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
     """Images and depth maps (16 bits, one channel) of a folder and of its direct subfolders."""
     pictures: list[Path] = []
     depths: list[Path] = []
@@ -345,7 +301,7 @@ def _survey_loose_pictures(capture: FoundCapture, frames: int) -> Survey:
     shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
     with doors.restrict_links(None if capture.follow_links else capture.path):
-        pictures, depths = classify_images(capture.path)
+        pictures, depths = _classify_images(capture.path)
         for kind, sources in (("image", pictures), ("depth", depths)):
             for file in spread_evenly(sources, frames):
                 try:
@@ -387,120 +343,50 @@ def print_survey(capture: FoundCapture, survey: Survey, console: Any = None) -> 
 
 
 def write_contact_sheet(survey: Survey, out: Path) -> Path:
-    """Write the contact sheet into ``out``: images, depth, confidence; below, depth histogram and camera path.
+    """Write the contact sheet into ``out``: images, depth on one scale, confidence.
 
     Returns:
         The PNG file, named after the recording.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    rows = [kind for kind in ("image", "depth", "conf") if any(getattr(t, kind) is not None for t in survey.tiles)]
-    plot_conditions = ((_plot_depths, survey.depths.numel() > 0), (_plot_path, survey.path is not None))
-    plots = [draw for draw, is_available in plot_conditions if is_available]
-    first = next((x for t in survey.tiles for x in (t.image, t.depth) if x is not None), torch.zeros(3, 4))
-    tiles_height = 1.6 * min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5) * len(rows) + 0.15
-    width = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8)
-    heights = [tiles_height, 1.9] if plots else [tiles_height]
-    figure = Figure(figsize=(width, sum(heights) + 0.3), dpi=120, layout="constrained")
+    tiles = survey.tiles
+    low, high = np.percentile(survey.depths.numpy(), (1, 99)).tolist() if survey.depths.numel() else (0.0, 1.0)
+    scales = {"depth": Scale("depth, m; blank: no return", DEPTH_CMAP, low, max(high, low + 1e-3), log=False)}
+    scales["conf"] = Scale("", SCORE_CMAP, 0.0, 2.0, log=False)
+    rows = []
+    for kind, label in (("image", "frame"), ("depth", "depth"), ("conf", "confidence")):
+        given = [getattr(tile, kind) for tile in tiles]
+        ratio = max((x.shape[-2] / x.shape[-1] for x in given if x is not None), default=None)
+        if ratio is not None:
+            painted = [_paint_tile(x, scales.get(kind), ratio) for x in given]
+            rows.append([(f"{label} {tile.title[:22]}", x) for tile, x in zip(tiles, painted, strict=True)])
+    has_depth = any(tile.depth is not None for tile in tiles)
+    shown = ((scales["depth"], 0, len(tiles) - 1),) if has_depth else ()
     title = f"{format_capture_name(survey.name)}: {survey.format}"
-    figure.suptitle(title, fontsize=9, fontweight="bold", color=INK, x=0.01, ha="left")
-    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    _draw_tiles(parts[0], rows, survey)
-    for k, draw in enumerate(plots):
-        draw(parts[1].add_subplot(1, len(plots), k + 1), survey)
+    width = max(150.0, 340.0 / max(1, len(tiles)))
+    figure, _ = make_image_grid(title, rows or [[("no frame", np.ones((3, 4)))]], shown, width=width, dpi=120.0)
     file = out / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', survey.name) or 'capture'}.png"
-    with storage.replace_at_end(file) as unfinished:
-        figure.savefig(unfinished, format="png")
+    save_figure(figure, file)
     return file
 
 
-def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
-    """One axes a row, each tile in a cell of width 1: an axes a tile takes several times as long."""
-    limits = _depth_limits(survey.depths)
-    sizes = [
-        getattr(tile, kind).shape[-2:] for tile in survey.tiles for kind in rows if getattr(tile, kind) is not None
-    ]
-    height = max((h / w for h, w in sizes), default=0.75)
-    for r, kind in enumerate(rows):
-        axes = figure.add_subplot(len(rows), 1, r + 1)
-        axes.axis("off")
-        axes.annotate(_ROW_LABELS[kind], (0, height / 2), (-4, 0), rotation=90, **_BESIDE_TILES)
-        for k, tile in enumerate(survey.tiles):
-            picture = getattr(tile, kind)
-            if picture is None:
-                continue
-            hw = picture.shape[-2:]
-            half_width = (0.5 - _TILE_GAP) * min(1.0, height * hw[1] / hw[0])
-            half_height = half_width * hw[0] / hw[1]
-            extent = k + 0.5 - half_width, k + 0.5 + half_width, height / 2 - half_height, height / 2 + half_height
-            step = max(1, max(picture.shape[-2:]) // 400)
-            if kind == "image":
-                pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
-                axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY_CMAP, extent=extent)
-            elif kind == "depth":
-                sparse = float((picture > 0).double().mean()) < _SPARSE_SHARE
-                shown = _nearest_per_block(picture, 3 * step) if sparse else picture[::step, ::step]
-                masked = np.ma.masked_equal(shown.numpy(), 0)
-                axes.imshow(masked, cmap=DEPTH_CMAP, vmin=limits[0], vmax=limits[1], extent=extent)
-                # Outline of a depth map, whose holes are white
-                from matplotlib.patches import Rectangle  # noqa: PLC0415
-
-                left, right, bottom, top = extent
-                axes.add_patch(
-                    Rectangle(
-                        (left, bottom), right - left, top - bottom, fill=False, edgecolor=UNANSWERED, linewidth=0.6
-                    )
-                )
-            else:
-                pixels = picture[::step, ::step].numpy()
-                axes.imshow(pixels, cmap=SCORE_CMAP, vmin=0, vmax=2, interpolation="nearest", extent=extent)
-            if not any(getattr(tile, above) is not None for above in rows[:r]):
-                place = (extent[0] + extent[1]) / 2, extent[3]
-                words = f"frame {tile.title}" if tile.title.isdigit() else tile.title
-                axes.annotate(words[:22], place, (0, 2), textcoords="offset points", fontsize=6, ha="center")
-        axes.set(xlim=(-_TILE_GAP, len(survey.tiles) + _TILE_GAP), ylim=(0, height), aspect="equal")
-
-
-def _depth_limits(depths: Tensor) -> tuple[float, float]:
-    if not depths.numel():
-        return 0.0, 1.0
-    low, high = np.percentile(depths.numpy(), (1, 99))
-    return float(low), float(max(high, low + 1e-3))
-
-
-def _nearest_per_block(depth: Tensor, size: int) -> Tensor:
-    """Nearest return in each block of ``size`` px, 0 without one: single sparse returns would be invisible."""
-    negated = torch.where(depth > 0, -depth, -torch.inf)
-    best = -torch.nn.functional.max_pool2d(negated[None], size, ceil_mode=True)[0]
-    return torch.where(torch.isfinite(best), best, torch.zeros_like(best))
-
-
-def _plot_depths(axes: Any, survey: Survey) -> None:
-    """Histogram of depth in the colours of the depth maps."""
-    from matplotlib import colormaps  # noqa: PLC0415
-
-    low, high = _depth_limits(survey.depths)
-    counts, edges = np.histogram(survey.depths.numpy(), bins=90, range=(0, 1.1 * high))
-    middle = (edges[1:] + edges[:-1]) / 2
-    axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[DEPTH_CMAP]((middle - low) / (high - low)))
-    axes.set_xlabel("depth, m, coloured as above (white: no return)", fontsize=7)
-    axes.set_yticks([])
-    axes.tick_params(labelsize=6)
-
-
-def _plot_path(axes: Any, survey: Survey) -> None:
-    """Camera path along the two axes of largest motion, both at one scale."""
-    assert survey.path is not None
-    t = survey.path.double().numpy()
-    a, b = sorted(np.argsort(np.ptp(t, axis=0))[1:])
-    axes.plot(t[:, a], t[:, b], color=INK, linewidth=0.8)
-    for place, mark, colour, label in (
-        (t[0], "o", SERIES_COLOURS[0], "first"),
-        (t[-1], "s", SERIES_COLOURS[1], "last"),
-    ):
-        axes.plot(place[a], place[b], mark, color=colour, markersize=4, label=label)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"path of the camera: {'xyz'[a]}, m", fontsize=7)
-    axes.set_ylabel(f"{'xyz'[b]}, m", fontsize=7)
-    axes.tick_params(labelsize=6)
-    axes.legend(fontsize=6, frameon=False)
+def _paint_tile(pixels: Tensor | None, scale: Scale | None, ratio: float) -> np.ndarray:
+    """Image, or values on a scale, as colours in a white frame with this ratio of height to width; blank for None."""
+    if pixels is None:
+        return np.ones((3, 4))
+    step = max(1, max(pixels.shape[-2:]) // 400)
+    if scale is None:
+        image = to_unit_rgb(pixels[:, ::step, ::step])
+        painted = np.stack([image] * 3, -1) if image.ndim == 2 else image
+    else:
+        values = pixels[::step, ::step]
+        if scale.low > 0 and float((pixels > 0).double().mean()) < _SPARSE_SHARE:
+            # The nearest return in each block of pixels: single sparse returns would be invisible
+            negated = torch.where(pixels > 0, -pixels, -torch.inf)[None]
+            values = -torch.nn.functional.max_pool2d(negated, 3 * step, ceil_mode=True)[0]
+        shown = values.double().numpy()
+        painted = scale.paint(shown, np.isfinite(shown) & ((shown > 0) | (scale.low == 0)))
+    h, w = painted.shape[:2]
+    framed = np.ones((max(h, round(ratio * w)), max(w, round(h / ratio)), 3))
+    top, left = (framed.shape[0] - h) // 2, (framed.shape[1] - w) // 2
+    framed[top : top + h, left : left + w] = painted
+    return framed

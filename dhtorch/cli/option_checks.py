@@ -61,7 +61,10 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "dtype": _one_of("float32", "float64"),
     "device": ((lambda v: isinstance(v, str)), "a device that torch can use on this machine, e.g. cpu or cuda"),
     **dict.fromkeys(("figures", "points"), _one_of(True, False, "all")),
-    **dict.fromkeys(("resume", "traceback", "arrays", "budget", "past"), _TRUE_OR_FALSE),
+    **dict.fromkeys(
+        ("resume", "traceback", "arrays", "budget", "past", "browser", "markdown", "yes", "data.follow_links"),
+        _TRUE_OR_FALSE,
+    ),
     "cutoff": _or_null(_ABOVE_ZERO),
     "holdout.cutoff": _or_null(_ABOVE_ZERO),
     "holdout.truth": _one_of("raw", "5x5", "full"),
@@ -156,11 +159,11 @@ def quote_words(argv: Sequence[str], sweep: bool = False) -> list[str]:
     for word in argv:
         key, sign, value = word.partition("=")
         if sign and value and not word.startswith("-"):
-            listed = "," in value and not value.startswith(("'", '"'))
+            listed = "," in value and not value.startswith(("'", '"', "["))
             if key in _PATH_OPTIONS and listed and (not sweep or key == "output" or Path(value).exists()):
                 quoted.append(f"{key}={quote_value(value)}")
                 continue
-            if key.lstrip("+") in _LIST_OPTIONS and listed and not sweep and not value.startswith(("[", "{")):
+            if key.lstrip("+") in _LIST_OPTIONS and listed and not sweep and not value.startswith("{"):
                 quoted.append(f"{key}=[{value}]")
                 continue
             try:
@@ -235,7 +238,8 @@ def validate_option_names(
             continue
         if plain in known or plain.startswith(("hydra.", "hydra/")) or (key != plain and _is_accepted(plain, settings)):
             continue
-        near = console.suggest_name(plain, [*elsewhere, *known])
+        typed = [name.removeprefix("data.") for name in known]  # options of readers are typed without it
+        near = console.suggest_name(plain, [*elsewhere, *known, *typed])
         raise ValueError(f"{plain}: found an unknown option{near}, expected one listed by --help")
 
 

@@ -33,13 +33,16 @@ from dhtorch.records import Camera, Frame, PinResult
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import Progress, format_count
 from dhtorch.runtime.output_folder import open_output_folder
-from dhtorch.viz.viewer.pin import PinnedEpisode, write_pin_page
+from dhtorch.viz.viewer import validation as pages
 
 #: Names that ``fail_on`` accepts → the quantity compared with the limit.
 _PIN_LIMITS = {
     "moved": "shift of the scene in the picture, px, less two standard deviations, of the worst episode",
     "unknown": "fraction of the pictures from which the camera's place cannot be known",
 }
+
+#: Columns of the page's table, after the episode's name.
+_TABLE_COLUMNS = ("verdict", "median shift, px", "its sigma, px", "largest shift, px", "changes")
 
 #: Horizontal field of view assumed where nothing is stated, degrees: shifts in px do not depend on it.
 _ASSUMED_FOV_DEG = 60.0
@@ -289,11 +292,23 @@ def _write_pages(
             verdict += f": {PinReason.entries[int(middle.reason)].definition}"
         cells = [verdict, *(f"{x:.2f}" if math.isfinite(x) else "–" for x in numbers), str(len(episode.changes))]
         after = encode_png(_to_rgb(episode.worst)) if rank < settings["pictures"] else None
-        shown.append(PinnedEpisode(episode.name, cells, before if after else None, after))
+        shown.append(pages.ValidatedFrame(episode.name, cells, before if after else None, after))
     drift = [(episode.name, episode.numbers, episode.result.shift_px.tolist()) for episode in episodes]
     counts = ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in summary["episodes"].items())
     sentences = [f"{settings['source']} against {settings['ref']}: {counts}.", *pin.notes]
-    write_pin_page(folder / "pin.html", "Was the camera moved?", sentences, shown, drift, failed=exceeded)
+    pages.write_validation_page(
+        folder / "pin.html",
+        "Was the camera moved?",
+        sentences=sentences,
+        columns=_TABLE_COLUMNS,
+        frames=shown,
+        failed=exceeded,
+        word="pin",
+        note=None,
+        kind="episode",
+        above=[pages.draw_drift(drift)],
+        own=Path(pages.__file__).with_name("pin.css"),
+    )
 
 
 def _to_rgb(image: Tensor) -> np.ndarray:

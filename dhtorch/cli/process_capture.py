@@ -12,7 +12,10 @@ import inspect
 import io
 import math
 import shlex
+import shutil
+import sys
 import time
+import webbrowser
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,12 +25,14 @@ import numpy as np
 import torch
 
 from dhtorch import export
-from dhtorch.cli import complete, recover_page
-from dhtorch.cli import completed_folder as completed
+from dhtorch.cli import complete
 from dhtorch.cli.capture_checks import describe_missing_depth, print_check
-from dhtorch.cli.completed_folder import CompletionTask
+from dhtorch.cli.complete import CompletionTask
+from dhtorch.cli.gate_messages import describe_gate, suggest_remedy
 from dhtorch.cli.inspect import FoundCapture, describe_pictures, find_captures
+from dhtorch.codes import words
 from dhtorch.data import FORMATS, FormatError, open_all
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.foreign_files import describe_layout
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
@@ -39,9 +44,10 @@ from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Pose
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import Progress, format_count
+from dhtorch.runtime.console import Progress, format_count, has_screen
 from dhtorch.runtime.output_folder import open_output_folder
-from dhtorch.validation.capture_check import check_capture
+from dhtorch.validation.capture_check import MAX_EXPLAINED_LOSS, CaptureCheck, check_capture
+from dhtorch.validation.pose_check import MAX_UNEXPLAINED_DISAGREEMENT, PoseCheck
 from dhtorch.viz.plots import (
     CompletedView,
     Strip,
@@ -91,13 +97,24 @@ _MIN_FPS, _MAX_FPS, _VIDEO_SECONDS = 2, 10, 8
 #: Files written beside those of ``dhtorch complete``.
 _FURTHER_FILES = (CONTACT_SHEET, PREVIEW_VIDEO, "map.ply", "map.glb", "view.html")
 
+#: Ratio of baseline to depth, and of that ratio to the angle of rotation in rad, below which stated poses have too
+#: small a baseline. Source: chosen: a tenth of the advised ratio; above 0.12 to 0.18 of ``tum_fr1_rpy_a``, which turns,
+#: and the 0.13 below which ``stages.shared_error.verify_views`` withholds a view.
+_MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN = 0.01, 0.2
 
-class NothingToRecover(ValueError):
+#: Reasons for missing answers listed on the page, the most frequent.
+_MAX_LISTED_REASONS = 3
+
+#: Smallest fraction of the pixels of a listed reason.
+_MIN_REASON_SHARE = 0.005
+
+
+class _NothingToRecover(ValueError):
     """Nothing can be recovered from a capture; the message gives the reason and the remedy."""
 
 
 @dataclass
-class RecoveredFrames:
+class _RecoveredFrames:
     """Progress on one recording."""
 
     task: CompletionTask
@@ -118,6 +135,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data, or nothing can be recovered.
         KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
+    if "browser" in settings:
+        return _run_demo(settings, parts, progress)
     file_from_world(settings["axes"], (0.0, 1.0, 0.0))  # refuses other axes before the computation
     path = Path(str(settings["path"])).expanduser()
     reader_options = {name: value for name, value in settings["data"].items() if value is not None}
@@ -134,7 +153,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     for capture in captures:
         try:
             recordings += [(capture.path, recording) for recording in _open_capture(capture)]
-        except (NothingToRecover, FormatError) as error:
+        except (_NothingToRecover, FormatError) as error:
             if len(captures) == 1:
                 raise
             refused.append(str(error))
@@ -148,17 +167,48 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             own = {**settings, "path": place}
             try:
                 lines = _process_recording(recording, folder, own, parts["method"], until, progress)
-            except NothingToRecover as nothing:
+            except _NothingToRecover as nothing:
                 refused.append(str(nothing))
                 continue
             n_done += 1
             print("\n".join(lines), flush=True)
     if n_done == 0:
-        raise NothingToRecover("; ".join(refused[:3]))
+        raise _NothingToRecover("; ".join(refused[:3]))
     for line in refused:
         print(line)
     if len(chosen) < len(recordings):
         print(f"{len(chosen)} of {len(recordings)} recordings done; recordings=null does all")
+    return 0
+
+
+def _run_demo(settings: Mapping[str, Any], parts: Mapping[str, Any], progress: Progress) -> int:
+    """``dhtorch demo``: write the built-in room as a capture and process it as ``dhtorch PATH`` does.
+
+    Six frames take half a minute on a quiet machine. The room is 6 m deep, so that much lies beyond the range of the
+    simulated LiDAR; the camera moves as in a slow walk.
+
+    Raises:
+        FileExistsError: the folder has other content.
+    """
+    from dhtorch.export.stray import write_stray  # noqa: PLC0415
+    from dhtorch.synthetic.recording import SyntheticRoom  # noqa: PLC0415
+
+    folder = Path(settings["out"]).expanduser()
+    capture, out, unfinished = folder / "room", folder / "result", folder / "room.unfinished"
+    if not (capture / "odometry.csv").is_file():
+        if folder.exists() and (not folder.is_dir() or any(each != unfinished for each in folder.iterdir())):
+            raise FileExistsError(f"out: {folder} has other content, expected a new or empty folder")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        room = SyntheticRoom(n_frames=6, hw=(240, 320), range_limit=2.5, step_m=0.05)
+        write_stray(unfinished, list(room))
+        unfinished.rename(capture)
+    typed = [word for word in settings["typed"] if word.partition("=")[0] not in ("out", "browser")]
+    own = {k: v for k, v in settings.items() if k != "browser"} | {"path": str(capture), "out": str(out)}
+    run({**own, "typed": [str(capture), f"out={out}", *typed]}, parts, progress=progress)
+    address = (out / "view.html").absolute().as_uri()
+    print(f"Open {address}")
+    if settings["browser"] and sys.stdout.isatty() and has_screen():
+        webbrowser.open(address)
     return 0
 
 
@@ -170,7 +220,7 @@ def find_recording_captures(path: Path, format: str = "auto") -> list[FoundCaptu
 
     Raises:
         FormatError: no capture.
-        NothingToRecover: only captures of other kinds.
+        _NothingToRecover: only captures of other kinds.
     """
     if format != "auto":
         return [FoundCapture(path, "recording", format, "format= given")]
@@ -180,15 +230,15 @@ def find_recording_captures(path: Path, format: str = "auto") -> list[FoundCaptu
         return recordings
     if captures[0].kind == "stacks":
         what = f"focal stacks ({captures[0].format}) of a still camera"
-        raise NothingToRecover(f"{path}: {what}; images from two positions and depth of near surfaces are required")
-    raise NothingToRecover(f"{path}: {describe_pictures(path, captures)}")
+        raise _NothingToRecover(f"{path}: {what}; images from two positions and depth of near surfaces are required")
+    raise _NothingToRecover(f"{path}: {describe_pictures(path, captures)}")
 
 
 def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
     """The recordings of a capture.
 
     Raises:
-        NothingToRecover: it has depth but no images.
+        _NothingToRecover: it has depth but no images.
         FormatError: it cannot be read.
     """
     try:
@@ -203,10 +253,10 @@ def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
             raise error from None
         foreign = describe_layout(capture.path, is_read=True)
         lack = f": {foreign.what}, expected {foreign.remedy}" if foreign else f" ({error})"
-        raise NothingToRecover(f"{capture.path}: depth without images, which tracking requires{lack}") from None
+        raise _NothingToRecover(f"{capture.path}: depth without images, which tracking requires{lack}") from None
 
 
-def order_evenly(n: int) -> list[int]:
+def _order_evenly(n: int) -> list[int]:
     """0 … n − 1 ordered so that the first k are spread evenly for every k, first the middle and both ends.
 
     The rest is the van der Corput sequence: halves, quarters, eighths …, in bit-reversed order, so that no part of the
@@ -221,13 +271,13 @@ def _find_usable_frame(recording: Recording) -> int:
     """Position of a readable frame with images and depth.
 
     Raises:
-        NothingToRecover: no such frame, or fewer than two frames.
+        _NothingToRecover: no such frame, or fewer than two frames.
     """
     if len(recording) < 2:
         remedy = "recovering depth requires a second view from another position"
-        raise NothingToRecover(f"{recording.name}: {format_count(len(recording), 'frame')}; {remedy}")
+        raise _NothingToRecover(f"{recording.name}: {format_count(len(recording), 'frame')}; {remedy}")
     causes, n_without_depth = [], 0
-    for k in order_evenly(len(recording))[:_MAX_TRIED_FRAMES]:
+    for k in _order_evenly(len(recording))[:_MAX_TRIED_FRAMES]:
         try:
             frame = recording[k]
         except FormatError as error:
@@ -235,13 +285,13 @@ def _find_usable_frame(recording: Recording) -> int:
             continue
         if 0 in frame.hw:
             what = "depth without images, which tracking requires (rgb.mp4, or a folder of images)"
-            raise NothingToRecover(f"{recording.name}: {what}")
+            raise _NothingToRecover(f"{recording.name}: {what}")
         if bool((frame.depth > 0).any()):
             return k
         n_without_depth += 1
     if n_without_depth:
-        raise NothingToRecover(describe_missing_depth(recording, n_without_depth))
-    raise NothingToRecover(f"{recording.name}: no frame can be read: {causes[0]}")
+        raise _NothingToRecover(describe_missing_depth(recording, n_without_depth))
+    raise _NothingToRecover(f"{recording.name}: no frame can be read: {causes[0]}")
 
 
 # ---------------------------------------------------------------------------------------------------------- processing
@@ -271,23 +321,23 @@ def _process_recording(
         folder,
         method,
         complete_settings,
-        completed.digest_scene_files(scene, complete_settings, folder),
+        complete.digest_scene_files(scene, complete_settings, folder),
         sized_as=usable,
     )
-    order = [i for i in order_evenly(len(recording)) if i in task.offers and i % settings["every"] == 0]
+    order = [i for i in _order_evenly(len(recording)) if i in task.offers and i % settings["every"] == 0]
     order = order[: settings["max_frames"]]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
-    with completed.open_task_folder(task, _FURTHER_FILES):
+    with complete.open_task_folder(task, _FURTHER_FILES):
         recovered = _complete_in_time(task, until, progress)
         if not recovered.frames:
             reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")
-            raise NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
-        stats = recover_page.measure_recovery(task, recovered.frames)
+            raise _NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
+        stats = complete.measure_recovery(task, recovered.frames)
         placed = _place_frames(recovered)
-        lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
-        lines += recover_page.describe_placing(check, recording, placed)
-        opening = recover_page.build_opening(
-            [*recover_page.describe_check(check), *lines],
+        lines = describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
+        lines += describe_placing(check, recording, placed)
+        opening = build_opening(
+            [*describe_check(check), *lines],
             stats,
             *write_overview(task, recovered.frames),
         )
@@ -298,9 +348,9 @@ def _process_recording(
         return [*lines, _format_next_step(recovered, shown), f"Wrote {', '.join(written)} in {folder}."]
 
 
-def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> RecoveredFrames:
+def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> _RecoveredFrames:
     """Complete the frames in order until the time limit, at least one; unreadable ones are skipped, also as views."""
-    recovered = RecoveredFrames(task, [], {}, 0)
+    recovered = _RecoveredFrames(task, [], {}, 0)
     todo = [i for i in task.frames if task.missing(i)]
     recovered.frames = [i for i in task.frames if not task.missing(i)]
     n_before = len(recovered.frames)
@@ -320,7 +370,7 @@ def _complete_in_time(task: CompletionTask, until: float | None, progress: Progr
     return recovered
 
 
-def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
+def _try_frame(recovered: _RecoveredFrames, i: int) -> bool:
     """Complete frame ``i`` -> success; unreadable source views are removed and the frame is tried again."""
     task = recovered.task
     while i not in recovered.broken:
@@ -345,7 +395,7 @@ def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
     return False
 
 
-def _place_frames(recovered: RecoveredFrames) -> Recording:
+def _place_frames(recovered: _RecoveredFrames) -> Recording:
     """The recording with poses that join its frames: its own, else the motions that near returns gave, chained.
 
     Frames that no motion links to the first completed one have no finite pose.
@@ -371,14 +421,18 @@ def _place_frames(recovered: RecoveredFrames) -> Recording:
 
 
 def _write_map(
-    recovered: RecoveredFrames, placed: Recording, opening: PageOpening, settings: Mapping[str, Any], progress: Progress
+    recovered: _RecoveredFrames,
+    placed: Recording,
+    opening: PageOpening,
+    settings: Mapping[str, Any],
+    progress: Progress,
 ) -> list[str]:
     """Write the fused map (PLY, GLB) and the viewer page; returns the file names."""
     task = recovered.task
     voxel = choose_voxel(task.recording, recovered.frames) if settings["voxel"] is None else settings["voxel"]
 
     def read(k: int) -> FrameMap:
-        maps, source = completed.read_completed_maps(task, k)
+        maps, source = complete.read_completed_maps(task, k)
         depth, sigma = (torch.from_numpy(np.ascontiguousarray(maps[x])).float() for x in ("depth", "sigma"))
         return FrameMap(depth, sigma, torch.from_numpy(np.ascontiguousarray(source)))
 
@@ -432,7 +486,7 @@ def write_moving_preview(task: CompletionTask, frames: Sequence[int], progress: 
 
 
 def _read_view(task: CompletionTask, i: int) -> CompletedView:
-    maps, source = completed.read_completed_maps(task, i)
+    maps, source = complete.read_completed_maps(task, i)
     picture = np.atleast_3d(complete.resize_picture(task.recording[i], source.shape)).transpose(2, 0, 1)
     return CompletedView(f"Frame {task.done[task.name(i)]['frame']}", picture, maps["depth"], maps["sigma"], source)
 
@@ -446,7 +500,7 @@ def _pick_evenly(frames: Sequence[int], n: int) -> list[int]:
 # ------------------------------------------------------------------------------------------------------------ summary
 
 
-def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
+def _format_next_step(recovered: _RecoveredFrames, shown: str) -> str:
     """The printed next step; ``shown`` is the file to open."""
     task, n = recovered.task, len(recovered.broken)
     settings = task.settings
@@ -467,9 +521,94 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
             text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
             words.append(f"data.{name}={text.lower() if isinstance(value, bool) else text}")
     cutoff = 2.0  # m, where no completed frame has a return
-    median = recover_page.measure_median_return(task, recovered.frames)
+    median = complete.measure_median_return(task, recovered.frames)
     if median is not None:  # rounded up to two digits
         step = 10.0 ** (math.floor(math.log10(median)) - 1)
         cutoff = math.ceil(median / step - 1e-9) * step
     command = shlex.join(["dhtorch", "run", str(settings["path"]), *words, "--cutoff", f"{cutoff:g}"])
     return f"Next: open {shown}; to measure the error on your capture: {command}{broken}"
+
+
+def describe_recovery(
+    task: CompletionTask, stats: complete.RecoveryStats, hw: tuple[int, int], check: CaptureCheck
+) -> list[str]:
+    """Printed sentences: the capture (images (h, w)), and what was recovered, else what its check shows."""
+    recording, (h, w) = task.recording, hw
+    kind = f"{task.scene.name}: a {recording.format} capture, {format_count(len(recording), 'frame')} of {w}x{h}"
+    filled = f"{stats.pixels['filled']:,.0f}" if stats.fractions["filled"] else ""
+    guess = intrinsics_options.find_guess_report(recording.report)
+    sensor = f"{kind}; the sensor has depth at {stats.fractions['sensor']:.0%} of the pixels"
+    sensor += f"; its {guess}." if guess else "."
+    if stats.error is None:
+        blamed = bool(check.findings) and stats.fractions["no_answer"] > _MIN_REASON_SHARE
+        reason = str(check.findings[0]) if blamed else _explain_silence(stats, check.poses)
+        also = f" Filled {filled} pixels per frame by interpolation." if filled else ""
+        return [sensor, f"Nothing was recovered: {reason}.{also}"]
+    amount = f"Recovered {stats.pixels['recovered']:,.0f} pixels per frame from other views, at {stats.near:.1f} m to"
+    amount += f" {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth"
+    amount += f"; filled {filled} by interpolation" if filled else ""
+    return [sensor, f"{amount} ({format_count(stats.frames, 'frame')})."]
+
+
+def describe_check(check: CaptureCheck) -> list[str]:
+    """Sentences of the page on what was assumed and on the findings."""
+    assumed = [f"{check.assumed_unit[:1].upper()}{check.assumed_unit[1:]}."] if check.assumed_unit else []
+    return [*assumed, *(f"Warning: {finding}." for finding in check.findings)]
+
+
+def describe_placing(check: CaptureCheck, recording: Recording, placed: Recording) -> list[str]:
+    """Sentence on how the map is joined where the capture's poses are not used; none where they are."""
+    if recording.poses is not None or placed.poses is None:
+        return []
+    n = int(placed.poses.t.isfinite().all(-1).sum())
+    why = "the stated poses are refuted" if check.poses_refuted else "the capture has no poses"
+    return [f"The map is joined by the motion that near returns give ({format_count(n, 'frame')}): {why}."]
+
+
+def build_opening(sentences: Sequence[str], stats: complete.RecoveryStats, picture: bytes, caption: str) -> PageOpening:
+    """The opening of the page; ``picture`` is the PNG of the contact sheet."""
+    shown = {"Recovered pixels per frame": f"{stats.pixels['recovered']:,.0f}"}
+    if stats.error is not None:
+        shown["Recovered, median sigma / depth"] = f"{stats.error:.1%}"
+    for kind, fraction in stats.fractions.items():
+        shown[f"{words(kind).capitalize()}, fraction of the pixels"] = f"{fraction:.1%}"
+    listed = [
+        f"{describe_gate(name)} ({share:.1%} of the pixels)"
+        for name, share in stats.reasons
+        if share >= _MIN_REASON_SHARE
+    ]
+    reason_lines = (
+        [f"Most frequent reasons for no answer: {'; '.join(listed[:_MAX_LISTED_REASONS])}."] if listed else []
+    )
+    return PageOpening(shown, [*sentences, *reason_lines], picture, caption)
+
+
+def _explain_silence(stats: complete.RecoveryStats, poses: PoseCheck | None) -> str:
+    """Most frequent reason for missing answers that has a remedy."""
+    for name, share in stats.reasons:
+        if share > 0.01 and (remedy := suggest_remedy(name)) is not None:
+            if name == "no_baseline" and stats.motion is not None:
+                return _explain_no_baseline(stats.motion, poses)
+            return remedy
+    return "the sensor has depth almost everywhere; cutoff=2.0 hides far returns to show what other views recover"
+
+
+def _explain_no_baseline(motion: complete.StatedMotion, poses: PoseCheck | None) -> str:
+    """Why near returns show no translation although poses are stated: what these and the check of the capture show."""
+    ratio = motion.baseline / motion.depth
+    moved = f"the stated poses move by {motion.baseline:.2g} m between views, {ratio:.1%} of the median depth"
+    if ratio < max(_MIN_BASELINE_RATIO, _MIN_BASELINE_PER_TURN * motion.turn):
+        turned = f"and turn by {math.degrees(motion.turn):.0f} degrees"
+        return f"{moved}, {turned}; moving sideways by a tenth of the distance would help"
+    unexplained = f"{moved}, which the near returns do not show; more texture, and returns nearby, would help"
+    if poses is None:
+        return unexplained
+    if poses.surfaces.stated > MAX_UNEXPLAINED_DISAGREEMENT:
+        disagreement = f"{poses.surfaces.stated:.1%} of the depth"
+        return f"{moved}, but poses and depth disagree by {disagreement}: one of them is wrong or noisy"
+    if poses.tracks is None:
+        return f"{moved}, but too few near returns were tracked; slower motion, more light and texture would help"
+    if poses.tracks.stated > MAX_EXPLAINED_LOSS:
+        loss = f"near returns miss their tracks: mean loss {poses.tracks.stated:.2f} of 1"
+        return f"{moved}, but depth and images do not fit each other ({loss}); see K, and whether one was resized"
+    return unexplained

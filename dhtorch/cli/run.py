@@ -12,12 +12,10 @@ import functools
 import hashlib
 import importlib
 import logging
-import math
 import multiprocessing
 import os
 import re
 import shlex
-import shutil
 import signal
 import sys
 import threading
@@ -32,29 +30,25 @@ from typing import Any
 import dhtorch
 from dhtorch.cli import commands
 from dhtorch.cli import option_checks as words
-from dhtorch.cli import sweep_state as together
 from dhtorch.cli.option_checks import quote_value
 from dhtorch.runtime import console, parent_watch
 from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.runtime.output_folder import open_output_folder
-
-#: Sub-command → module with ``main(argv) -> int``.
-_PARSED_COMMANDS = {
-    "inspect": "dhtorch.cli.inspect",
-    "report": "dhtorch.experiments.report",
-    "fetch": "dhtorch.cli.fetch",
-}
 
 #: Sub-command with its own settings ``conf/<name>.yaml`` → module with ``run(settings, parts, *, progress)`` -> exit
 #: code; ``settings`` are all options as plain values, ``parts`` the instantiated options that name a function.
 _CONFIGURED_COMMANDS = {
     "align": "dhtorch.cli.align",
     "complete": "dhtorch.cli.complete",
+    "demo": "dhtorch.cli.process_capture",
     "enrich": "dhtorch.cli.enrich",
     "extract": "dhtorch.extract",
+    "fetch": "dhtorch.cli.fetch",
+    "inspect": "dhtorch.cli.inspect",
     "integrate": "dhtorch.integrate.mapping",
     "pin": "dhtorch.cli.pin",
     "recover": "dhtorch.cli.process_capture",
+    "report": "dhtorch.experiments.report",
     "scale": "dhtorch.cli.scale",
     "stream": "dhtorch.cli.stream",
     "validate": "dhtorch.cli.validate",
@@ -67,6 +61,7 @@ _POSITIONAL_OPTIONS = {
     "report": ("result",),
     **dict.fromkeys(("align", "complete", "extract", "integrate", "run", "stream", "validate"), ("data.root",)),
     "enrich": ("data.root", "out"),
+    "fetch": ("set",),
     "pin": ("ref", "source"),
     "recover": ("path",),
     "scale": ("model", "data.root"),
@@ -157,7 +152,7 @@ def _run_guarded(argv: list[str]) -> int:
         console.discard_broken_pipe()
         return EXIT_BROKEN_PIPE
     except Exception as error:
-        if not (isinstance(error, USER_ERRORS) or is_settings_error(error)):
+        if not (isinstance(error, USER_ERRORS) or _is_settings_error(error)):
             raise
         return _report_failure(unwrap_cause(error), show=any(_TRACEBACK_OPTION.fullmatch(a) for a in argv))
     except KeyboardInterrupt as stop:  # a sub-command may add how to continue
@@ -191,30 +186,28 @@ def _dispatch(argv: list[str]) -> int:
         words.validate_words(argv[:1], ["PATH", *commands.COMMANDS])
     typed = argv[1:] if named else argv
     if help_flags:
-        return _show_help(name, typed, everything="--help-all" in help_flags)
+        # Print the help of a command; ``everything`` also lists the groups and the composed settings
+        everything = "--help-all" in help_flags
+        print(commands.format_command_help(name, config_dir()))
+        if everything:
+            overrides = [a for a in typed if "=" in a]
+            print("\nGroups (choose with group=name):")
+            for folder in sorted(p for p in config_dir().iterdir() if p.is_dir()):
+                print(f"{folder.name}: {', '.join(sorted(p.stem for p in folder.glob('*.yaml')))}")
+            print("\nOptions (set with key=value), with their present values:\n")
+            _show_hydra_info(name, [*overrides, "--cfg", "job"])
+        return EXIT_DONE
     flags = _SWEEP_FLAGS | _HYDRA_INFO_FLAGS if name == "run" else _HYDRA_INFO_FLAGS
-    flags = set() if name in _PARSED_COMMANDS else flags
     known = commands.list_options(name, config_dir())
     argv = commands.to_overrides(name, typed, known, flags, console.suggest_name)
     if named:
         _reject_missing_input(name, argv)
-    if name in _PARSED_COMMANDS:
-        # Run a command with its own argument parser
-        _check_flags(argv, _HELP_FLAGS)
-        unknown = [a for a in argv if not _is_positional(a) and a.partition("=")[0] not in known]
-        if unknown:
-            readers = [f"data.{option}" for option in _reader_options(config_dir())]
-            plain = [full.rpartition(".")[2] for full in known]
-            words.validate_option_names(unknown, {}, (), [*known, *readers], plain)
-        _set_threads(1)
-        parsed = commands.to_parser_arguments(argv, known)
-        return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
     if name == "run":
         argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
         argv = [_NO_HOLDOUT if a.partition("=")[0] == "~holdout" else a for a in argv]
         words.validate_words(argv, ())
         return _run_hydra(argv)
-    return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
+    return _run_configured(name, _add_implied_choice(argv))
 
 
 def _reject_missing_path(word: str) -> None:
@@ -245,71 +238,9 @@ def _reject_missing_input(name: str, argv: Sequence[str]) -> None:
     typed = [word for word in argv if _is_positional(word)]
     for option, word in zip(_POSITIONAL_OPTIONS.get(name, ()), typed, strict=False):
         path = Path(word).expanduser()
-        if option != "out" and not path.exists() and not (option == "source" and word.isdigit()):
+        if option not in ("out", "set") and not path.exists() and not (option == "source" and word.isdigit()):
             expected = f"one that exists (dhtorch {name} {commands.COMMANDS[name].usage})"
             raise ValueError(f"{word}: no such file or folder{console.suggest_path(path)}, expected {expected}")
-
-
-def _show_help(name: str, argv: list[str], *, everything: bool) -> int:
-    """Print the help of a command; ``everything`` also lists the groups and the composed settings."""
-    print(commands.format_command_help(name, config_dir()))
-    if everything and name not in _PARSED_COMMANDS:
-        name = commands.COMMANDS[name].config or name
-        overrides = [a for a in argv if "=" in a]
-        print("\nGroups (choose with group=name):")
-        for folder in sorted(p for p in config_dir().iterdir() if p.is_dir()):
-            print(f"{folder.name}: {', '.join(sorted(p.stem for p in folder.glob('*.yaml')))}")
-        print("\nOptions (set with key=value), with their present values:\n")
-        _show_hydra_info(name, [*overrides, "--cfg", "job"])
-    return EXIT_DONE
-
-
-def _run_demo(argv: list[str]) -> int:
-    """Write the built-in room as a capture and process it as ``dhtorch PATH`` does."""
-    options = {"out": "dhtorch_out/demo", "browser": "true"}
-    options |= {k: v for k, _, v in (a.partition("=") for a in argv) if k in options}
-    if options["browser"] not in ("true", "false"):
-        raise ValueError(f"browser: found {options['browser']!r}, expected true or false")
-    rest = [a for a in argv if a.partition("=")[0] not in ("out", "browser")]
-    words.validate_words(rest, ())
-    import webbrowser  # noqa: PLC0415
-
-    from dhtorch.cli.view import has_screen  # noqa: PLC0415
-
-    _set_threads(1)
-    folder = Path(options["out"]).expanduser()
-    _write_demo_capture(folder)
-    out = folder / "result"
-    code = _run_configured("recover", [str(folder / "room"), f"out={quote_value(str(out))}", *rest])
-    if code == EXIT_DONE:
-        address = (out / "view.html").absolute().as_uri()
-        print(f"Open {address}")
-        if options["browser"] == "true" and sys.stdout.isatty() and has_screen():
-            webbrowser.open(address)
-    return code
-
-
-def _write_demo_capture(folder: Path) -> None:
-    """Write the room as a Stray Scanner capture ``room`` below ``folder``, unless it is there.
-
-    Six frames take half a minute on a quiet machine. The room is 6 m deep, so that much lies beyond the range of the
-    simulated LiDAR; the camera moves as in a slow walk.
-
-    Raises:
-        FileExistsError: ``folder`` has other content.
-    """
-    from dhtorch.export.stray import write_stray  # noqa: PLC0415
-    from dhtorch.synthetic.recording import SyntheticRoom  # noqa: PLC0415
-
-    unfinished = folder / "room.unfinished"
-    if (folder / "room" / "odometry.csv").is_file():
-        return
-    if folder.exists() and (not folder.is_dir() or any(each != unfinished for each in folder.iterdir())):
-        raise FileExistsError(f"out: {folder} has other content, expected a new or empty folder")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    room = SyntheticRoom(n_frames=6, hw=(240, 320), range_limit=2.5, step_m=0.05)
-    write_stray(unfinished, [room[k] for k in range(len(room))])
-    unfinished.rename(folder / "room")
 
 
 def _add_implied_choice(argv: list[str]) -> list[str]:
@@ -354,7 +285,16 @@ def _run_configured(word: str, argv: list[str]) -> int:
     module = importlib.import_module(_CONFIGURED_COMMANDS[word])
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     disable_malloc_trim()
-    _set_threads(settings.get("threads"))
+    # Set the threads of torch and OpenCV; None keeps their defaults. Beside other work more than one thread
+    # spins
+    threads = settings.get("threads", 1)
+    import torch  # noqa: PLC0415
+
+    from dhtorch.data.io.decode import set_opencv_threads  # noqa: PLC0415
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+        set_opencv_threads(threads)
     data = parts.get("data")
     if data is not None:
         from dhtorch.cli.capture_checks import check_data, require_depth  # noqa: PLC0415
@@ -369,7 +309,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
             remedy = "without_depth=true writes empty maps" if word == "enrich" else None
             require_depth(scenes_of(data), remedy=remedy)
         parts["data"] = data
-    settings |= {"choices": groups} | ({"typed": typed} if word == "recover" else {})
+    settings |= {"choices": groups} | ({"typed": typed} if word in ("demo", "recover") else {})
     with console.mute_if_quiet():
         return int(module.run(settings, parts, progress=console.progress) or EXIT_DONE)
 
@@ -395,21 +335,12 @@ def compose_settings(word: str, argv: list[str]) -> tuple[dict[str, Any], dict[s
     del cfg["hydra"]
     settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     words.validate_values(settings, defaults)
+    if word in ("inspect", "scale", "view") and settings["max_frames"] is None:
+        raise ValueError("max_frames: found None, expected a whole number of at least 1")
     _check_objects(settings, groups)
-    _check_device(word, settings["device"])
+    _check_device(word, settings.get("device", "cpu"))
     function_options = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
     return settings, _instantiate_parts(cfg, function_options), groups
-
-
-def _set_threads(threads: int | None) -> None:
-    """Set the threads of torch and OpenCV; None keeps their defaults. Beside other work more than one thread spins."""
-    import torch  # noqa: PLC0415
-
-    from dhtorch.data.io.decode import set_opencv_threads  # noqa: PLC0415
-
-    if threads is not None:
-        torch.set_num_threads(threads)
-        set_opencv_threads(threads)
 
 
 def _check_device(name: str, device: str) -> None:
@@ -485,7 +416,11 @@ def _load_settings(path: Path) -> Any:
 def _name_positionals(name: str, argv: Sequence[str]) -> list[str]:
     """The arguments with the option names of the positional ones added, first; a path chooses ``data=auto``."""
     options = _POSITIONAL_OPTIONS.get(name, ())
-    places = [k for k, word in enumerate(argv) if _is_positional(word)][: len(options)]
+    places = [k for k, word in enumerate(argv) if _is_positional(word)]
+    if name == "report" and places:
+        results = ",".join(quote_value(argv[k]) for k in places)
+        return [f"result=[{results}]", *(word for k, word in enumerate(argv) if k not in places)]
+    places = places[: len(options)]
     if name == "view" and places:
         place = Path(argv[places[0]])
         has_result = any(place.glob("result.json")) or any(place.glob("*/result.json"))
@@ -580,15 +515,9 @@ def _run_hydra(argv: list[str]) -> int:
 
 def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_command: str, show_traceback: bool) -> int:
     """Run all jobs of a sweep, print their states, return the exit code."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
-
-    parser = OverridesParser.create(config_loader=engine.config_loader)
-    swept = [each for each in parser.parse_overrides(list(overrides)) if each.is_sweep_override()]
-    n_jobs = math.prod(len(list(each.sweep_string_iterator())) for each in swept)
     go_on = f"Finished jobs are kept. To run the rest:\n  {resume_command}"
     try:
-        with together.show_sweep_progress(folder, n_jobs):
-            batches = engine.multirun("run", _run_hydra_job, list(overrides))
+        batches = engine.multirun("run", _run_hydra_job, list(overrides))
     except KeyboardInterrupt:
         print(f"\ndhtorch: interrupted. {go_on}", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -626,50 +555,45 @@ def _run_hydra_job(cfg: Any) -> Any:
         parent_watch.exit_with_parent()
     disable_malloc_trim()  # every frame allocates the same sizes
     with console.escape_output(), console.show_warnings_in_a_line():
-        return _run_job(cfg)
+        from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
+        from omegaconf import OmegaConf  # noqa: PLC0415
 
+        console.configure_logging()
+        from dhtorch.cli import job  # noqa: PLC0415
+        from dhtorch.data.scene import scenes_of  # noqa: PLC0415
 
-def _run_job(cfg: Any) -> Any:
-    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
-    from omegaconf import OmegaConf  # noqa: PLC0415
+        runtime = HydraConfig.get().runtime
+        swept = not OmegaConf.is_missing(HydraConfig.get().job, "num")  # only jobs of a sweep are numbered
+        try:
+            settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+            words.validate_values(settings)
+            _check_objects(settings, runtime.choices)
+            _check_device("run", settings["device"])
+            parts = _instantiate_parts(cfg, _OBJECT_GROUPS)
+            if runtime.choices["experiment"] in _DEPTH_EXPERIMENTS:
+                from dhtorch.cli.capture_checks import require_depth  # noqa: PLC0415
 
-    console.configure_logging()
-    from dhtorch.cli import job  # noqa: PLC0415
-    from dhtorch.data.scene import scenes_of  # noqa: PLC0415
-
-    runtime = HydraConfig.get().runtime
-    swept = not OmegaConf.is_missing(HydraConfig.get().job, "num")  # only jobs of a sweep are numbered
-    sweep, name = Path(runtime.output_dir).parent, Path(runtime.output_dir).name
-    try:
-        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        words.validate_values(settings)
-        _check_objects(settings, runtime.choices)
-        _check_device("run", settings["device"])
-        parts = _instantiate_parts(cfg, _OBJECT_GROUPS)
-        if runtime.choices["experiment"] in _DEPTH_EXPERIMENTS:
-            from dhtorch.cli.capture_checks import require_depth  # noqa: PLC0415
-
-            require_depth(scenes_of(parts["data"]))
-        scenes = len(parts["data"]) if isinstance(parts["data"], Sequence) else 1
-        progress = together.record_progress(sweep, name, scenes) if swept else console.progress
-        _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
-        with console.mute_if_quiet():
-            status = job.run(
-                settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress, swept=swept
-            )
-        if console.get_verbosity() == "quiet":
-            print(Path(status.folder) / "result.json", flush=True)
-        return status
-    except Exception as error:
-        cause = unwrap_cause(error)
-        expected = isinstance(cause, USER_ERRORS) or is_settings_error(cause)
-        _report_failure(cause, show=cfg.traceback or not expected)
-        with contextlib.suppress(OSError):
-            Path(runtime.output_dir).rmdir()  # only if empty
-        return job.JobStatus(runtime.output_dir, "failed", format_error(cause))
-    finally:
-        if swept:
-            together.mark_finished(sweep, name)
+                require_depth(scenes_of(parts["data"]))
+            _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
+            with console.mute_if_quiet():
+                status = job.run(
+                    settings,
+                    parts,
+                    dict(runtime.choices),
+                    Path(runtime.output_dir),
+                    progress=console.progress,
+                    swept=swept,
+                )
+            if console.get_verbosity() == "quiet":
+                print(Path(status.folder) / "result.json", flush=True)
+            return status
+        except Exception as error:
+            cause = unwrap_cause(error)
+            expected = isinstance(cause, USER_ERRORS) or _is_settings_error(cause)
+            _report_failure(cause, show=cfg.traceback or not expected)
+            with contextlib.suppress(OSError):
+                Path(runtime.output_dir).rmdir()  # only if empty
+            return job.JobStatus(runtime.output_dir, "failed", format_error(cause))
 
 
 def _check_objects(settings: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
@@ -773,11 +697,11 @@ def format_error(error: BaseException) -> str:
     if isinstance(error, KeyError) and len(error.args) == 1:
         return str(error.args[0])
     return (
-        message if isinstance(error, USER_ERRORS) or is_settings_error(error) else f"{type(error).__name__}: {message}"
+        message if isinstance(error, USER_ERRORS) or _is_settings_error(error) else f"{type(error).__name__}: {message}"
     )
 
 
-def is_settings_error(error: BaseException) -> bool:
+def _is_settings_error(error: BaseException) -> bool:
     """Whether the error is Hydra's, OmegaConf's or YAML's, whose messages name the option or the file."""
     return type(error).__module__.startswith(("hydra.", "omegaconf.", "yaml."))
 

@@ -45,8 +45,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
         raise ValueError(f"device: found {settings['device']!r}, expected cpu: the measurement is small")
     if settings["frame"] not in ("model", "capture"):
         raise ValueError(f"frame: found {settings['frame']!r}, expected model or capture")
-    if settings["max_frames"] is None:
-        raise ValueError("max_frames: found None, expected a whole number of at least 1")
     if not settings["tolerance"] > 0:
         raise ValueError(f"tolerance: found {settings['tolerance']!r}, expected a positive number")
     scenes = scenes_of(parts["data"])

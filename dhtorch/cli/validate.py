@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from dhtorch.cli.completed_folder import Row, load_frame
+from dhtorch.cli.complete import Row, load_frame
 from dhtorch.codes import State, WrongCause, names, words
 from dhtorch.data import depth_maps
 from dhtorch.data import intrinsics as intrinsics_options
@@ -61,15 +61,15 @@ _MIN_SCALE_DIFFERENCE = 0.03
 #: The poses agree with one of the two if its log ratio to them is at most this fraction of the other's.
 _MAX_WITNESS_RATIO = 1 / 3
 
+_LIMIT_PATTERN = re.compile(r"\s*([a-z_]+)\s*>\s*([0-9.eE+-]+)\s*")
+
 #: Causes of wrong pixels that the summary names, and the least fraction of the checked pixels from which it does.
 _NAMED_CAUSES = ("ghost", "flying_pixel", "edge_bleed")
 _MIN_NAMED_SHARE = 0.0005
 
-_LIMIT_PATTERN = re.compile(r"\s*([a-z_]+)\s*>\s*([0-9.eE+-]+)\s*")
-
 
 @dataclass
-class RecordingValidation:
+class _RecordingValidation:
     """Validation of one recording."""
 
     scene: Scene
@@ -110,18 +110,16 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             maps = None
             if settings["depth"] is not None:
                 maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
-            validation = _validate_recording(RecordingValidation(scene, maps), method, settings, progress)
+            validation = _validate_recording(_RecordingValidation(scene, maps), method, settings, progress)
             summary = _summarise_recording(validation)
             exceeded = list_exceeded_limits(summary, limits)
             content = {
                 "scene": scene.name,
                 "source": "sensor" if maps is None else "maps",
                 "fail_on": settings["fail_on"],
-            }
-            content |= {} if maps is None else {"maps": maps.report}
-            content |= {"notes": list(scene.recording.report)}
-            content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
-            content |= {
+                **({} if maps is None else {"maps": maps.report}),
+                "notes": list(scene.recording.report),
+                "intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report),
                 "exceeded": exceeded,
                 "whole": summary,
                 "windows": validation.windows,
@@ -144,12 +142,12 @@ def list_exceeded_limits(
     whole: Mapping[str, Any], limits: Mapping[str, float], known: Mapping[str, str] = _VALIDATION_LIMITS
 ) -> list[str]:
     """Texts of the limits exceeded by a recording; an unknown quantity exceeds no limit."""
-    lines = []
-    for name, limit in limits.items():
-        value = whole["limited"][name]
-        if value is not None and value > limit:
-            lines.append(f"{name} is {value:.4g}, limit {limit:g} ({known[name]})")
-    return lines
+    values = {name: whole["limited"][name] for name in limits}
+    return [
+        f"{name} is {value:.4g}, limit {limits[name]:g} ({known[name]})"
+        for name, value in values.items()
+        if value is not None and value > limits[name]
+    ]
 
 
 def parse_limits(text: str | None, known: Mapping[str, str] = _VALIDATION_LIMITS) -> dict[str, float]:
@@ -175,8 +173,8 @@ def parse_limits(text: str | None, known: Mapping[str, str] = _VALIDATION_LIMITS
 
 
 def _validate_recording(
-    validated: RecordingValidation, method: Method, settings: Mapping[str, Any], progress: Progress
-) -> RecordingValidation:
+    validated: _RecordingValidation, method: Method, settings: Mapping[str, Any], progress: Progress
+) -> _RecordingValidation:
     """Validate the frames one by one, then diagnose windows of frames."""
     n = len(validated.scene.recording)
     with_map = list(range(n)) if validated.maps is None else validated.maps.frames
@@ -223,24 +221,24 @@ def _summarise_frame(number: int, validation: DepthValidation) -> Row:
     """DepthValidation -> row of a frame: fractions by state, intervals, evidence coverage."""
     has_depth = validation.depth > 0
     n = int(has_depth.sum())
-    row: Row = {"frame": number, "pixels": n}
-    for code, name in names(State).items():
-        row[f"share_{name.lower()}"] = int(((validation.state == code) & has_depth).sum()) / n if n else None
     wrong_by_cause = validation.cause[has_depth & (validation.state == State.WRONG)]
-    row["wrong_causes"] = {
-        name.lower(): int((wrong_by_cause == code).sum()) for code, name in names(WrongCause).items()
+    causes = {name.lower(): int((wrong_by_cause == code).sum()) for code, name in names(WrongCause).items()}
+    row: Row = {
+        "frame": number,
+        "pixels": n,
+        **{
+            f"share_{name.lower()}": int(((validation.state == code) & has_depth).sum()) / n if n else None
+            for code, name in names(State).items()
+        },
+        "wrong_causes": {name: count for name, count in causes.items() if name != "none"},
     }
-    del row["wrong_causes"]["none"]
     for name in _INTERVAL_FIELDS:
         value, low, high = (float(x) for x in getattr(validation, name)[0])
         row[name] = None if math.isnan(value) else {"value": value, "low": low, "high": high}
     for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence"):
         evidence = getattr(validation, name)[has_depth]
-        against = evidence.abs() > 3
-        row[name] = {
-            "coverage": float(evidence.isfinite().double().mean()) if n else None,
-            "against": int(against.sum()),
-        }
+        coverage = float(evidence.isfinite().double().mean()) if n else None
+        row[name] = {"coverage": coverage, "against": int((evidence.abs() > 3).sum())}
     clip_depth = float(validation.clip_depth[0])
     return row | {"clip_depth": None if math.isnan(clip_depth) else clip_depth}
 
@@ -251,7 +249,7 @@ def _severity(row: Row) -> float:
     return float(wrong) if wrong is not None else -1.0
 
 
-def _diagnose_window(validated: RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
+def _diagnose_window(validated: _RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
     """Diagnose ``size`` consecutive frames -> row with the likely cause."""
     frames = [load_frame(validated.scene, settings, k) for k in range(first, first + size)]
     diagnosis = faults.Diagnosis(None, None, {}, 0)
@@ -291,7 +289,7 @@ def _find_shared_clip_depth(rows: Sequence[Row]) -> float | None:
 # ------------------------------------------------------------------------------------------------------------- summary
 
 
-def _summarise_recording(validated: RecordingValidation) -> Row:
+def _summarise_recording(validated: _RecordingValidation) -> Row:
     """Statistics of a recording; ``limited`` are those that ``fail_on`` limits."""
     rows = validated.rows
     pixels = sum(row["pixels"] for row in rows)
@@ -404,7 +402,7 @@ def _format_factor(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 1e4 else f"{value:.4g}"
 
 
-def _write_page(place: Path, validated: RecordingValidation, whole: Row, exceeded: Sequence[str]) -> Path:
+def _write_page(place: Path, validated: _RecordingValidation, whole: Row, exceeded: Sequence[str]) -> Path:
     rows = sorted(validated.rows, key=_severity, reverse=True)
     frames = []
     for row in rows:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Progress, Settings
 from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.runtime import results as result_files
-from dhtorch.runtime.console import format_count
+from dhtorch.runtime.console import format_count, has_screen
 from dhtorch.runtime.output_folder import is_whole, open_output_file
 from dhtorch.runtime.storage import read_utf8
 from dhtorch.viz.viewer import again, html, points, rrd
@@ -113,8 +112,6 @@ def _compute_exhibit(
 ) -> Exhibit:
     """Compute the exhibit of the selected scene; ``cutoff``: scene name -> cutoff, m."""
     scene = _select_item(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
-    if settings["max_frames"] is None:
-        raise ValueError("max_frames: found None, expected a whole number of at least 1")
     dtype = getattr(torch, settings["dtype"])
     common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
@@ -140,8 +137,3 @@ def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> A
     if isinstance(wanted, int) and 0 <= wanted < len(names):
         return items[wanted]
     raise ValueError(f"scene: found {wanted!r}, expected a number below {len(names)} or one of {', '.join(names[:12])}")
-
-
-def has_screen() -> bool:
-    """Whether windows can be opened on this machine."""
-    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

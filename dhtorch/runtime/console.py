@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import io
 import logging
+import multiprocessing
 import os
 import sys
 import time
@@ -32,12 +33,6 @@ _LINE_INTERVAL_S = 30.0
 
 #: Names of a folder that are compared with a missing one. Bounds the time of a message.
 _MAX_NAMES_COMPARED = 2000
-
-#: End of the help text of sub-commands with their own argument parser.
-HELP_EPILOG = (
-    "-q prints only results and errors, -v also logs inputs and steps, as in every dhtorch command. "
-    "Exit code: 0 done, 2 bad option or bad data, 130 interrupted, 143 or 129 ended by SIGTERM or SIGHUP."
-)
 
 
 def format_count(n: int, word: str) -> str:
@@ -69,7 +64,12 @@ def suggest_path(missing: Path) -> str:
     return f" (did you mean {below.with_name(near[0])}?)" if near else ""
 
 
-def escape_control(text: str) -> str:
+def has_screen() -> bool:
+    """Whether windows can be opened on this machine."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _escape_control(text: str) -> str:
     """Text with control and bidirectional characters escaped, so that a terminal does not interpret them; line ends and
     tabs are kept."""
     if text.isascii() and text.isprintable():
@@ -86,17 +86,17 @@ def escape_markup(text: str) -> str:
     """Text for rich in which neither rich markup nor control characters are interpreted."""
     from rich.markup import escape  # noqa: PLC0415
 
-    return escape(escape_control(text))
+    return escape(_escape_control(text))
 
 
 def unwrap_terminal(stream: Any) -> TextIO:
     """The raw stream, for writers that control the terminal and escape other text by :func:`escape_markup`."""
-    raw: TextIO = stream.stream if isinstance(stream, EscapingStream) else stream
+    raw: TextIO = stream.stream if isinstance(stream, _EscapingStream) else stream
     return raw
 
 
-class EscapingStream:
-    """Stream wrapper that escapes written text by :func:`escape_control`; everything else is delegated.
+class _EscapingStream:
+    """Stream wrapper that escapes written text by :func:`_escape_control`; everything else is delegated.
 
     Not a subclass of Python's streams, which would close the wrapped stream on deletion.
     """
@@ -106,7 +106,7 @@ class EscapingStream:
 
     def write(self, text: str) -> int:
         """Write escaped text."""
-        self.stream.write(escape_control(text))
+        self.stream.write(_escape_control(text))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
@@ -122,7 +122,7 @@ class EscapingStream:
 def escape_output() -> Iterator[None]:
     """Context in which stdout and stderr escape control characters."""
     old_streams: Any = sys.stdout, sys.stderr
-    escaping: Any = tuple(s if isinstance(s, EscapingStream) else EscapingStream(s) for s in old_streams)
+    escaping: Any = tuple(s if isinstance(s, _EscapingStream) else _EscapingStream(s) for s in old_streams)
     sys.stdout, sys.stderr = escaping
     try:
         yield
@@ -140,7 +140,7 @@ def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
 
     columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}")
     is_quiet = get_verbosity() == "quiet"
-    is_terminal = sys.stderr.isatty()
+    is_terminal = sys.stderr.isatty() and multiprocessing.current_process().name == "MainProcess"  # no worker's
     start = last_line = time.monotonic()
     bar_console = Console(file=unwrap_terminal(sys.stderr))
     with Progress(*columns, console=bar_console, disable=is_quiet or not is_terminal, transient=True) as bar:

@@ -17,7 +17,6 @@ from support import writers
 
 from dhtorch import MAP, data, export
 from dhtorch.cli import complete, run
-from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
@@ -58,7 +57,7 @@ def captures(room, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def numbered(captures, tmp_path_factory):
-    """Three frames of the numbered capture, completed."""
+    """Three frames of the numbered capture, complete."""
     out = tmp_path_factory.mktemp("out") / "maps"
     said(captures / "numbered", out, max_frames=3, arrays=True, points=True, figures=True)
     return out
@@ -137,9 +136,7 @@ def test_the_meta_file_tells_what_the_others_are(room, numbered):
 
 
 def test_figure_and_points_are_of_the_first_frame(room, numbered):
-    files = [
-        p.relative_to(numbered).as_posix() for k in completed.EXTRA_FILES for p in sorted((numbered / k).glob("*"))
-    ]
+    files = [p.relative_to(numbered).as_posix() for k in complete.EXTRA_FILES for p in sorted((numbered / k).glob("*"))]
     assert files == ["figures/000000.png", "points/000000.glb", "points/000000.ply"]
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
 
@@ -152,7 +149,7 @@ def test_a_tum_sequence_stays_one_with_its_own_step_and_stamps(captures, tmp_pat
         for kind in ("source", "depth", "sigma")
     )
     recovered, filled, sensor = (np.isin(source, codes) for codes in ([2, 3], [5], [1]))
-    median = np.median(sigma[recovered] / completed.SIGMA_STEPS_PER_DEPTH_STEP / depth[recovered])
+    median = np.median(sigma[recovered] / complete.SIGMA_STEPS_PER_DEPTH_STEP / depth[recovered])
     counts = f"recovered {recovered.mean():.1%} (median sigma {median:.1%} of the depth)"
     assert f"{counts}, filled {filled.mean():.1%}, sensor {sensor.mean():.1%}, no answer" in out and filled.any()
     there, back = data.open(captures / "stamped"), data.open(tmp_path / "maps")
@@ -252,25 +249,6 @@ def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
     before = stamps(tmp_path)
     assert "(1 left untouched)" in said(captures / "numbered", tmp_path, max_frames=2)
     assert stamps(tmp_path)["depth/000000.png"] == before["depth/000000.png"] and len(data.open(tmp_path)) == 2
-
-
-def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
-    asked = {"arrays": True, "max_frames": 3}
-    before = stamps(numbered)
-    for name, there, here in (("seed", 0, 1), ("planes", 16, 32), ("unit", 0.001, 0.002)):
-        with pytest.raises(FileExistsError, match=rf"complete.json: .*\({name} {there} there, {here} here\)"):
-            said(captures / "numbered", numbered, **asked, **{name: here})
-    with pytest.raises(FileExistsError, match="scene numbered there, stamped here"):
-        said(captures / "stamped", numbered, **asked, format="frames")
-    assert stamps(numbered) == before
-    note = tmp_path / "note.txt"
-    note.write_text("mine")
-    for folder in (tmp_path, captures / "numbered"):
-        with pytest.raises(FileExistsError, match="holds other files, expected an empty folder, or one"):
-            said(captures / "numbered", folder)
-    with pytest.raises(NotADirectoryError, match="is a file, expected a folder"):
-        said(captures / "numbered", note)
-    assert list(tmp_path.iterdir()) == [note]
 
 
 @pytest.mark.parametrize(

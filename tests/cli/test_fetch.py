@@ -5,6 +5,7 @@ import http.server
 import io
 import json
 import os
+import re
 import tarfile
 import threading
 import zipfile
@@ -14,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from dhtorch.cli import fetch
-from dhtorch.cli.fetch import FetchedScene, download, fetch_scenes
-from dhtorch.cli.run import main
+from dhtorch.cli.fetch import _FetchedScene, fetch_scenes
 
 ROOT = os.environ.get("DHTORCH_DATA")
 
@@ -67,7 +67,7 @@ def scene(server, **changes):
         "cut": {"poses.txt": {"rows": [2, 3]}},
         "texts": {"meta.json": "{}"},
     }
-    return FetchedScene("kitchen", "CC BY 4.0", "https://example.org", FILES, **{**options, **changes})
+    return _FetchedScene("kitchen", "CC BY 4.0", "https://example.org", FILES, **{**options, **changes})
 
 
 def archive_of(*members, kind="w:gz"):
@@ -75,13 +75,10 @@ def archive_of(*members, kind="w:gz"):
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode=kind) as tar:
         for name, content in members:
-            info = tarfile.TarInfo(name)
-            if isinstance(content, str):
-                info.type, info.linkname = tarfile.SYMTYPE, content
-                tar.addfile(info)
-                continue
-            info.size = len(content)
-            tar.addfile(info, io.BytesIO(content))
+            info, is_link = tarfile.TarInfo(name), isinstance(content, str)
+            info.type, info.linkname = (tarfile.SYMTYPE, content) if is_link else (tarfile.REGTYPE, "")
+            info.size = 0 if is_link else len(content)
+            tar.addfile(info, None if is_link else io.BytesIO(content))
     return out.getvalue()
 
 
@@ -93,7 +90,7 @@ def archived(server, content, *, known=True, files=None, **changes):
         "inside": "set/",
     }
     files = {"rgb.png": sha(PICTURE)} if files is None else files
-    return FetchedScene("room", "MIT", "https://example.org", files, **{**options, **changes})
+    return _FetchedScene("room", "MIT", "https://example.org", files, **{**options, **changes})
 
 
 def names(folder):
@@ -128,41 +125,40 @@ def test_an_archive_gives_the_files_of_the_table_alone(server, tmp_path, kind):
     assert names(tmp_path) == ["out/room/rgb.png", "out/room/track.txt"], "nothing else, inside or outside"
 
 
-def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path):
-    server.cut = 60_000
-    with pytest.raises(OSError, match=r"found 60000 bytes, expected 102400; run again to go on"):
-        fetch_scenes([scene(server)], tmp_path)
-    assert names(tmp_path) == [], "no unfinished file has a name"
-    server.cut = None
-    assert fetch_scenes([scene(server)], tmp_path) == 3
-    assert [r for path, r in server.asked if "png" in path] == [None, "bytes=60000-"]
+KEY = "/kitchen/rgb/0%201.png"
+
+
+@pytest.mark.parametrize(
+    ("changes", "left", "limit", "words", "asked"),
+    [
+        ({"cut": 60_000}, None, 10**9, "found 60000 bytes, expected 102400; run again to go on", [None, "bytes=60000-"]),
+        ({"ranges": False}, b"old", 10**9, None, ["bytes=3-"]),
+        ({}, PICTURE + b"more", 10**9, None, ["bytes=102404-", None]),
+        ({}, PICTURE[:1000], 10**9, None, ["bytes=1000-"]),
+        ({"files": {KEY: PICTURE[:-1] + b"!"}}, None, 10**9, r"0%201.png: found SHA-256 \w+…, expected \w+…$", [None, None]),
+        ({}, None, 1000, "found more than 1000 bytes, expected at most that", [None, None]),
+        ({"files": {}}, None, 10**9, r"kitchen/rgb/0%201.png: Not Found", [None, None]),
+    ],
+)  # fmt: skip
+def test_a_download_goes_on_where_it_stopped_and_what_is_wrong_is_one_line(
+    server, tmp_path, changes, left, limit, words, asked
+):
+    """Changes of the server, bytes of an earlier try, limit of size → message, and the ranges that are asked for."""
+    made, parts = scene(server), tmp_path / ".dhtorch" / "fetch"
+    before = dict(vars(server))
+    vars(server).update(changes)
+    if left is not None:
+        parts.mkdir(parents=True)
+        (parts / f"{sha(f'{server.address}{KEY}'.encode())}.part").write_bytes(left)
+    if words is not None:
+        with pytest.raises((ValueError, OSError), match=words):
+            fetch_scenes([made], tmp_path, max_bytes=limit)
+        is_kept = len(list(tmp_path.rglob("*.part"))) == (1 if "cut" in changes else 0)
+        assert names(tmp_path) == [] and is_kept, "no unfinished file has a name, and a wrong one is not gone on with"
+        vars(server).update({name: before[name] for name in changes})
+    assert fetch_scenes([made], tmp_path) == 3
     assert (tmp_path / "kitchen/rgb/0 1.png").read_bytes() == PICTURE
-
-
-def test_a_server_without_ranges_and_a_stale_part_begin_anew(server, tmp_path):
-    server.files["/a"] = PICTURE
-    part = tmp_path / hashlib.sha256(f"{server.address}/a".encode()).hexdigest()
-    server.ranges = False
-    part.with_suffix(".part").write_bytes(b"old")
-    assert download(f"{server.address}/a", tmp_path, sha(PICTURE)).read_bytes() == PICTURE
-    server.ranges = True
-    part.with_suffix(".part").write_bytes(PICTURE + b"more")
-    assert download(f"{server.address}/a", tmp_path, sha(PICTURE)).read_bytes() == PICTURE
-
-
-def test_a_wrong_digest_a_size_above_the_limit_and_no_answer_are_one_line(server, tmp_path):
-    made = scene(server)
-    server.files["/kitchen/rgb/0%201.png"] = PICTURE[:-1] + b"!"
-    with pytest.raises(ValueError, match=r"0%201.png: found SHA-256 \w+…, expected \w+…$"):
-        fetch_scenes([made], tmp_path)
-    assert names(tmp_path) == [] and not list(tmp_path.rglob("*.part")), "a wrong file is not gone on with"
-    server.files["/kitchen/rgb/0%201.png"] = PICTURE
-    with pytest.raises(ValueError, match="found more than 1000 bytes, expected at most that"):
-        fetch_scenes([made], tmp_path, max_bytes=1000)
-    server.files.clear()
-    with pytest.raises(OSError, match=r"kitchen/rgb/0%201.png: Not Found"):
-        fetch_scenes([FetchedScene(**asdict(made))], tmp_path)
-    assert names(tmp_path) == []
+    assert [r for path, r in server.asked if "png" in path] == asked
 
 
 @pytest.mark.parametrize(
@@ -183,43 +179,39 @@ def test_an_archive_that_is_not_as_the_table_says_writes_nothing(server, tmp_pat
 
 
 def test_names_and_links_that_lead_out_are_refused(server, tmp_path):
-    for bad in ({"folder": "../x"}, {"files": {"a/../../x": "0"}}, {"texts": {"/x": ""}}, {"base": "file:///etc/"}):
-        file = tmp_path / "t.json"
-        file.write_text(json.dumps({"scenes": [asdict(scene(server)) | bad]}))
-        with pytest.raises(ValueError, match=r"t.json: .*expected (one inside the folder|an http or https address)"):
+    file, known = tmp_path / "t.json", asdict(scene(server))
+    for bad in (
+        {"folder": "../x"},
+        {"files": {"a/../../x": "0"}},
+        {"texts": {"/x": ""}},
+        {"base": "file:///etc/"},
+        None,
+    ):
+        file.write_text("[]" if bad is None else json.dumps({"scenes": [known | bad]}))
+        with pytest.raises(ValueError, match=r"t.json: .*expected one (inside|as)|t.json: .* an http or https address"):
             fetch.read_fetch_table(file)
-    (tmp_path / "t.json").write_text("[]")
-    with pytest.raises(ValueError, match="found no table of scenes"):
-        fetch.read_fetch_table(tmp_path / "t.json")
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "out").mkdir()
+    for folder in ("elsewhere", "out", "own/kitchen"):
+        (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "out" / "kitchen").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FileExistsError, match="a link"):
-        fetch_scenes([scene(server)], tmp_path / "out")
-    (tmp_path / "own" / "kitchen").mkdir(parents=True)
     (tmp_path / "own" / "kitchen" / "poses.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="did not write"):
-        fetch_scenes([scene(server)], tmp_path / "own")
+    for folder, message in (("out", "a link"), ("own", "did not write")):
+        with pytest.raises(FileExistsError, match=message):
+            fetch_scenes([scene(server)], tmp_path / folder)
     assert not list((tmp_path / "elsewhere").iterdir()) and (tmp_path / "own/kitchen/poses.txt").read_text() == "mine"
 
 
-def test_licences_come_first_and_nothing_is_fetched_without_consent(server, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DHTORCH_DATA", raising=False)
+def test_licences_come_first_and_nothing_is_fetched_without_consent(command, server, tmp_path, monkeypatch):
     (tmp_path / "t.json").write_text(json.dumps({"scenes": [asdict(scene(server))]}))
-    assert main(["fetch", "shared_scenes", "--table", "t.json"]) == 2
-    out, err = capsys.readouterr()
-    assert out == "kitchen: CC BY 4.0; https://example.org\n" and "licences not accepted" in err and not server.asked
-    assert main(["fetch", "shared_scenes", "--table", "t.json", "--yes"]) == 0
-    out, _ = capsys.readouterr()
-    assert out.index("CC BY") < out.index("3 files fetched into dhtorch_data")
+    words = ["fetch", "shared_scenes", "--table", "t.json"]
+    code, out, err = command(*words)
+    assert (code, out) == (2, "kitchen: CC BY 4.0; https://example.org\n") and not server.asked
+    assert "licences not accepted" in err
+    assert re.match(r"(?s)kitchen: CC BY.*3 files fetched into dhtorch_data", command(*words, "--yes")[1])
     monkeypatch.setenv("DHTORCH_DATA", str(tmp_path / "data"))
-    assert main(["fetch", "shared_scenes", "--table", "t.json", "--yes"]) == 0
-    assert len(names(tmp_path / "data")) == 3
+    assert command(*words, "--yes")[0] == 0 and len(names(tmp_path / "data")) == 3
     server.files.clear()
-    assert main(["fetch", "shared_scenes", "--table", "t.json", "--yes", "--out", "new"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("dhtorch: http://127.0.0.1") and "Not Found" in line
+    code, _, err = command(*words, "--yes", "--out", "new")
+    assert code == 2 and re.fullmatch(r"dhtorch: http://127.0.0.1\S+: Not Found.*\n", err)
 
 
 def test_the_table_names_every_shared_scene_with_its_licence():

@@ -99,23 +99,17 @@ def test_the_rest_is_computed_and_the_result_is_that_of_an_uninterrupted_run(
 
 
 @pytest.mark.slow
-def test_other_settings_and_a_run_without_resume_use_nothing(command, computed):
-    interrupt(command, computed, "a", after=2)
+def test_a_damaged_or_foreign_scene_other_settings_and_a_run_without_resume_use_nothing(command, computed):
+    first, second = sorted(interrupt(command, computed, "a", after=2))
     shutil.copytree("a", "b")
-    assert command(*ROOMS, "method.n=900", "resume=true", "output=a")[0] == 0
-    assert len(computed["scenes"]) == 3
-    computed["scenes"].clear()
-    assert command(*ROOMS, "output=b")[0] == 0 and len(computed["scenes"]) == 3
-
-
-@pytest.mark.slow
-def test_a_damaged_or_foreign_scene_is_computed_again(command, computed):
-    first, second = sorted(interrupt(command, computed, "o", after=2))
+    shutil.copytree("a", "c")
     first.write_bytes(first.read_bytes()[:-100])
     shutil.copy(first.parent / second.name, first.parent / "x.pt")
     stored = torch.load(second, weights_only=True)
     torch.save({**stored, "identity": (stored["identity"][0], "another scene")}, second)
-    assert command(*ROOMS, "resume=true", "output=o")[0] == 0 and len(computed["scenes"]) == 3
+    for words in (["resume=true", "output=a"], ["method.n=900", "resume=true", "output=b"], ["output=c"]):
+        computed["scenes"].clear()
+        assert command(*ROOMS, *words)[0] == 0 and len(computed["scenes"]) == 3
 
 
 @pytest.mark.slow

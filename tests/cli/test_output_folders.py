@@ -232,38 +232,6 @@ def test_a_folder_in_a_situation(situation, name, inputs, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_second_complete_leaves_files_and_links_of_others(capture, again, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    for name in ("a.png", "000001.png", "000009.png"):
-        (elsewhere / name).write_bytes(b"mine")
-    mine = [
-        "depth/000009.png",
-        "depth/a.png",
-        "depth/.a.png.b.tmp",
-        "figures/a.png",
-        "figures/000009.png",
-        "a",
-        "meta/a",
-    ]
-    for name in mine:
-        (again / name).write_bytes(b"mine")
-    links = {
-        "depth/link.png": elsewhere / "a.png",
-        "figures/dangling.png": tmp_path / "nowhere",
-        "figures/more": elsewhere,
-    }
-    for name, target in (links | {"points": elsewhere}).items():  # the last is a folder that these options do not write
-        (again / name).symlink_to(target)
-    before, others = contents(again), contents(elsewhere)
-    assert complete(capture, again, "max_frames=3", "figures=all") == 0
-    after = contents(again)
-    same = {name: content for name, content in before.items() if name != "poses.txt"}
-    assert {name: after[name] for name in same} == same
-    assert contents(elsewhere) == others and "depth/000002.png" in after and "figures/000002.png" in after
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
@@ -359,22 +327,6 @@ def test_a_folder_that_cannot_be_written_is_named(inputs, tmp_path, capsys, monk
 
 
 # ----------------------------------------------------------------------------------------------------- two, and killed
-
-
-@pytest.mark.slow
-def test_two_at_once_with_different_options_do_not_mix(capture, tmp_path):
-    out = tmp_path / "out"
-    words = ["complete", str(capture), f"out={out}", *COMPLETE]
-    ends = []
-    for k, more in enumerate(([], ["seed=7"])):
-        (tmp_path / str(k)).mkdir()
-        ends.append(start(tmp_path / str(k), *words, *more))
-    codes = [process.wait(200) for process in ends]
-    assert sorted(codes) == [run.EXIT_DONE, run.EXIT_FAILED]
-    line = one_line((tmp_path / str(codes.index(run.EXIT_FAILED)) / "err").read_text())
-    assert str(out) in line and ("dhtorch process" in line or "seed" in line)
-    keys = {json.loads(path.read_text())["key"] for path in (out / "meta").iterdir()}
-    assert len(keys) == 1 and len(data.open(out)) == 4
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""Whole runs of the command: files and printed text of a job, verbosity, progress, signals, sweeps, the demo."""
+"""Whole runs of the command: files and printed text of a job, verbosity, progress, signals, sweeps, the demo; what is finished
+stays, what is not is done, whatever stopped it, and one failing job stops no other."""
 
 import csv
 import errno
@@ -7,30 +8,35 @@ import json
 import logging
 import os
 import re
-import resource
 import shlex
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import hydra
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
 from support import writers
+from support.processes import start, stop
 from support.tiny_runs import ROOM, TINY
 
 from dhtorch.cli import inspect as capture
-from dhtorch.cli import process_capture, run
-from dhtorch.cli import sweep_state as together
+from dhtorch.cli import job, process_capture, run
+from dhtorch.cli.run import config_dir, job_name
 from dhtorch.codes import Source
 from dhtorch.experiments.outcome import DEPTH_METRICS
 from dhtorch.experiments.report import advice, jobs, page
 from dhtorch.runtime import console, storage
 from dhtorch.runtime import results as result_files
-from dhtorch.runtime.output_folder import open_output_file
+from dhtorch.runtime.output_folder import is_private, open_output_file
 from dhtorch.runtime.ply import read_ply_vertices
 from dhtorch.synthetic import recording as rooms
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -165,27 +171,22 @@ def test_batches_and_workers_give_the_same_rows(tmp_path):
 
 @pytest.mark.slow
 def test_quiet_prints_where_the_result_is_and_verbose_what_is_read(command, tmp_path):
-    code, out, err = command("-q", *TINY, "output=job", "resume=true")
-    result = tmp_path / "job" / "result.json"
-    assert (code, err) == (0, "") and out.strip() == str(result)
-    before = result.read_bytes()
-    code, out, err = command("-v", *TINY, "output=job", "resume=true")
-    assert code == 0 and result.read_bytes() == before, "verbosity is none of the settings"
-    code, out, err = command("--quiet", "--multirun", *TINY, "output=sweep", "seed=0,1")
-    assert (code, err) == (0, "") and len(out.split()) == 2 and all(Path(p).is_file() for p in out.split())
-    code, out, err = command("view", "job", f"html={tmp_path / 'view.html'}", "-q")
-    assert (code, out, err) == (0, "", "") and (tmp_path / "view.html").is_file()
-    code, out, err = command("-q", *TINY, "pairs.gap=99")
-    assert code == 2 and out == "" and "pairs.gap" in err
-    code, brief, _ = command(*TINY, "output=a")
-    assert code == 0 and len(brief.splitlines()) <= 15 and "samples by gate" not in brief
-    code, out, err = command(*TINY, "-v", "output=b")
-    lines = err.strip().splitlines()
-    assert code == 0 and "coverage" in out and len(out.splitlines()) > len(brief.splitlines())
-    assert all(re.match(r" *\d+ ms  dhtorch\.", line) for line in lines), err
-    assert any("synthetic_room" in line for line in lines) and any("digest" in line for line in lines)
+    result, brief = tmp_path / "job" / "result.json", command(*TINY, "output=a")[1]
+    for words, ends, out_holds, err_holds in (
+        (["-q", *TINY, "output=job", "resume=true"], 0, f"{result}$", "$"),
+        (["-v", *TINY, "output=job", "resume=true"], 0, ".*left untouched$", "."),  # verbosity is none of the settings
+        (["--quiet", "--multirun", *TINY, "output=sweep", "seed=0,1"], 0, r"\S+result.json\s\S+result.json$", "$"),
+        (["view", "job", f"html={tmp_path / 'view.html'}", "-q"], 0, "$", "$"),
+        (["-q", *TINY, "pairs.gap=99"], 2, "$", ".*pairs.gap"),
+        ([*TINY, "-v", "output=b"], 0, ".*coverage", r"( *\d+ ms  dhtorch\..*\n?)+$"),
+        ([*TINY, "output=c"], 0, ".*coverage", "$"),  # the next call is as before
+    ):
+        code, out, err = command(*words)
+        assert code == ends and re.match(out_holds, out.strip(), re.S) and re.match(err_holds, err), (words, out, err)
+        if "output=b" in words:
+            assert "synthetic_room" in err and "digest" in err and len(out.splitlines()) > len(brief.splitlines())
+    assert (tmp_path / "view.html").is_file() and len(brief.splitlines()) <= 15 and "samples by gate" not in brief
     assert not logging.getLogger("dhtorch").handlers and console._VERBOSITY_VARIABLE not in os.environ
-    assert command(*TINY, "output=c")[2] == "", "the next call is as before"
 
 
 class Terminal(io.StringIO):
@@ -196,69 +197,31 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(
-    ("stream", "level", "lines"),
+    ("stream", "level", "total", "step_s", "lines"),
     [
-        (Terminal, "normal", None),
-        (Terminal, "quiet", []),
-        (io.StringIO, "quiet", []),
-        (io.StringIO, "normal", ["room: 2 of 5, 5.0 s each, 0:15 left", "room: 4 of 5, 5.0 s each, 0:05 left"]),
+        (Terminal, "normal", 5, None, None),
+        (Terminal, "quiet", 5, None, []),
+        (io.StringIO, "quiet", 5, None, []),
+        (io.StringIO, "normal", 5, 5.0, ["2 of 5, 5.0 s each, 0:15 left", "4 of 5, 5.0 s each, 0:05 left"]),
+        (io.StringIO, "normal", 3, 7200.0, ["1 of 3, 7200.0 s each, 4:00:00 left", "2 of 3, 7200.0 s each, 2:00:00 left"]),
+        (io.StringIO, "normal", 60, 0.5, ["20 of 60, 2.0/s, 0:20 left", "40 of 60, 2.0/s, 0:10 left"]),
+        (io.StringIO, "normal", 25, 9.0, [f"{n} of 25, 9.0 s each, {9 * (25 - n) // 60}:{9 * (25 - n) % 60:02d} left" for n in range(2, 25, 2)]),
     ],
-)
-def test_progress_is_a_bar_on_a_terminal_and_a_line_now_and_then_elsewhere(monkeypatch, stream, level, lines):
+)  # fmt: skip
+def test_progress_is_a_bar_on_a_terminal_and_a_line_now_and_then_elsewhere(
+    monkeypatch, stream, level, total, step_s, lines
+):
     """Number done, rate and time left, not after the last item; none with quiet output."""
-    now = iter(np.arange(0, 100, 5.0).tolist())
-    if stream is not Terminal:
+    if step_s is not None:
+        now = iter(step_s * np.arange(total + 1))
         monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(now)))
     monkeypatch.setattr(console, "_LINE_INTERVAL_S", 10.0)
     monkeypatch.setattr(sys, "stderr", shown := stream())
     monkeypatch.setenv(console._VERBOSITY_VARIABLE, level)
     monkeypatch.setenv("TERM", "xterm")
-    assert list(console.progress(range(5), "room", 5)) == list(range(5))
-    assert ("room" in shown.getvalue()) if lines is None else shown.getvalue().splitlines() == lines
-
-
-@pytest.mark.parametrize(
-    ("total", "step_s", "line"), [(3600, 0.5, "2.0/s, 30:00 left"), (2, 7200.0, "7200.0 s each, 2:00:00 left")]
-)
-def test_the_time_left_is_in_minutes_or_hours(monkeypatch, total, step_s, line):
-    now = iter(step_s * np.arange(5))
-    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(now)))
-    monkeypatch.setattr(console, "_LINE_INTERVAL_S", 0.0)
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
-    monkeypatch.delenv(console._VERBOSITY_VARIABLE, raising=False)
-    next(bar := iter(console.progress(range(total), "room", total)))
-    next(bar)
-    assert sys.stderr.getvalue() == f"room: 1 of {total}, {line}\n"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="a terminal is made by a POSIX call")
-def test_no_color(tmp_path, frames):
-    """On a terminal of its own: a warning in yellow, and without colour where NO_COLOR states that."""
-    import pty  # noqa: PLC0415  (POSIX alone)
-
-    (tmp_path / "images").mkdir()
-    for kind in ("images", "depth"):
-        (tmp_path / "images" / f"{kind}.png").write_bytes((frames / "one" / kind / "00000.png").read_bytes())
-    code = (
-        "import os, sys; from dhtorch.cli.run import main; argv = ['inspect', 'images', '--out', 'sheets']; main(argv);"
-        "print('=' * 9); os.environ['NO_COLOR'] = '1'; main(argv)"
-    )
-    mine, theirs = pty.openpty()
-    env = {k: v for k, v in os.environ.items() if k != "NO_COLOR"} | {"TERM": "xterm", "COLUMNS": "100"}
-    child = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=env, stdout=theirs, stderr=theirs)
-    os.close(theirs)
-    printed = b""
-    with os.fdopen(mine, "rb", buffering=0) as stream:
-        try:
-            while part := stream.read(4096):
-                printed += part
-        except OSError:  # the other end is closed
-            pass
-    assert child.wait(60) == 0, printed
-    coloured, plain = printed.decode().split("=" * 9)
-    colour = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|9[0-7]|38;)")
-    assert colour.search(coloured) and "warning" in plain and not colour.search(plain)
+    assert list(console.progress(range(total), "room", total)) == list(range(total))
+    said = shown.getvalue()
+    assert ("room" in said) if lines is None else said.splitlines() == [f"room: {line}" for line in lines]
 
 
 EVIL = "a\x1b[31mred\x07\x9b2J\u202ereversed\r"
@@ -273,7 +236,7 @@ def test_nothing_that_a_terminal_obeys_is_printed(tmp_path, capsys):
     out, err = capsys.readouterr()
     assert out.splitlines()[0] == err.strip() == r"a\x1b[31mred\x07\x9b2J\u202ereversed\x0d" and out.endswith("1\t2\n")
     texts = {"naïve ✓ 深度": "naïve ✓ 深度", "\U000e0001": r"\U000e0001"}
-    assert {text: console.escape_control(text) for text in texts} == texts
+    assert {text: console._escape_control(text) for text in texts} == texts
     folder = tmp_path / EVIL.replace("\r", "")
     folder.mkdir()
     for words in (["inspect", str(folder)], ["report", str(folder)], [f"data.x={EVIL}"]):
@@ -342,22 +305,11 @@ def test_a_worker_ends_with_a_killed_parent(tmp_path):
         assert not Path(f"/proc/{worker}").exists()
 
 
-def test_a_full_disk_and_a_limit_of_size_name_the_file(tmp_path, monkeypatch):
-    def full(_handle):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch, pytest.raises(OSError, match=r"No space left on device: '.*x\.json'"):
-        patch.setattr(os, "fsync", full)
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(error))
+    with pytest.raises(OSError, match=r"No space left on device: '.*x\.json'"):
         storage.write_json(tmp_path / "x.json", {})
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-    try:
-        with pytest.raises(OSError, match=r"File too large: '.*x\.json'"):
-            storage.write_json(tmp_path / "x.json", list(range(1000)))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, before)
     assert not list(tmp_path.iterdir())
 
 
@@ -450,10 +402,10 @@ def test_the_printed_next_command_runs_with_the_reader_options_of_this_one(
 )
 def test_the_printed_cutoff_lies_among_the_returns(monkeypatch, depths, low, high):
     maps = lambda _, i: ({"depth": np.array(depths[i])}, np.full(len(depths[i]), int(Source.SENSOR)))  # noqa: E731
-    monkeypatch.setattr(process_capture.completed, "read_completed_maps", maps)
+    monkeypatch.setattr(process_capture.complete, "read_completed_maps", maps)
     settings = {"data": {"fov": 60, "K": None, "camera": ["a"]}, "path": "x", "reader_format": "tum"}
     task, frames = SimpleNamespace(settings=settings, scene=SimpleNamespace(name="x")), list(range(len(depths)))
-    line = process_capture._format_next_step(process_capture.RecoveredFrames(task, frames, {}, 0), "a.html")
+    line = process_capture._format_next_step(process_capture._RecoveredFrames(task, frames, {}, 0), "a.html")
     words, _, cutoff = line.rpartition(" --cutoff ")
     assert words.endswith("dhtorch run x data.fov=60 'data.camera=[a]' data.format=tum")
     assert low <= float(cutoff) <= high
@@ -473,7 +425,6 @@ def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):
     assert columns == ["pairs.gap", *(metric.name for metric in DEPTH_METRICS)]
     (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
     assert len(out.splitlines()) - at < 12
-    assert not (tmp_path / "a=b" / together._NOTES_FOLDER).exists()
     code, out, _ = command("report", "a=b")
     assert code == 0 and "pairs.gap" in out and "truth dropped" not in out
     assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
@@ -496,40 +447,199 @@ def test_few_answers_come_with_advice(shares, word):
     assert lines == [] if word is None else word in lines[0]
 
 
-def watch(monkeypatch):
-    """Descriptions and finished jobs of the bar over all jobs, as it is drawn."""
-    seen = []
-    bar = SimpleNamespace(add_task=lambda *_, **__: 0, update=lambda _, **shown: seen.append(shown))
-    entered = type("Bar", (), {"__enter__": lambda _: bar, "__exit__": lambda *_: None})
-    monkeypatch.setattr("rich.progress.Progress", lambda *_, **__: entered())
-    monkeypatch.setattr(together, "_PAUSE_S", 0.02)
-    return seen
+SIX = [*TINY, "method=paper,opencv", "seed=0,1,2"]
+LAUNCHERS = {
+    "basic": None,
+    "joblib": "hydra_joblib_launcher",
+    "submitit_local": "hydra_submitit_launcher",
+    "submitit_slurm": "hydra_submitit_launcher",
+    "ray": "hydra_ray_launcher",
+}
 
 
-def test_jobs_note_how_far_they_are(tmp_path, monkeypatch):
-    seen, ticks = watch(monkeypatch), iter([False, True])
-    draw = partial(together._draw_bar, tmp_path / together._NOTES_FOLDER, 2)
-    (tmp_path / together._NOTES_FOLDER).mkdir(parents=True)
-    wrap = together.record_progress(tmp_path, "one", 2)
-    assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
-    draw(SimpleNamespace(wait=lambda _: next(ticks)))
-    assert seen == [{"completed": 0.5, "description": "0 of 2 jobs, first"}]
-    together.mark_finished(tmp_path, "one")
-    ticks = iter([False, True])
-    draw(SimpleNamespace(wait=lambda _: next(ticks)))
-    assert seen[1:] == [{"completed": 1.0, "description": "1 of 2 jobs"}]
-    assert list(together.record_progress(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
+def results(folder):
+    """Files of finished jobs; folders may go while they are looked for."""
+    return sorted(Path(place, name) for place, _, names in os.walk(folder) for name in names if name == "result.json")
+
+
+def seen(paths):
+    """What must not change: bytes, inode and time of change."""
+    return {p: (p.read_bytes(), p.stat().st_ino, p.stat().st_mtime_ns) for p in paths}
+
+
+def asked(path):
+    result = result_files.read_result(path)
+    return next(r["method"] for r in result["rows"]), result["config"]["seed"]
 
 
 @pytest.mark.slow
-def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, monkeypatch):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    seen = watch(monkeypatch)
-    monkeypatch.setattr(together, "sys", SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True)))
-    few = ["data=synthetic_seeds", "data.seed=[0,1]", "data.hw=[60,80]", "data.n_frames=3"]
-    options = ["method.n=256", "pairs.gap=1,2", "figures=false", "launch=joblib", "hydra.launcher.n_jobs=2"]
-    code, _, err = command("-m", *few, *options, "output=sweep")
-    assert code == 0, err
-    done = [each["completed"] for each in seen]
-    assert done == sorted(done) and any(0 < x < 2 for x in done), "the notes of two workers are one growing sum"
-    assert "of 2 jobs" in seen[-1]["description"] and not (tmp_path / "sweep" / together._NOTES_FOLDER).exists()
+def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
+    sweep = ["-m", "resume=true", "output=sweep", *SIX]
+    code = stop(start(tmp_path, *sweep), partial(results, tmp_path), 2, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    before = seen(results(tmp_path))
+    assert 2 <= len(before) < 6
+    torn, *_ = before
+    left = torn.parent / ".dhtorch" / "unfinished" / "0.json"  # as if the kill had come while a file was written
+    left.parent.mkdir(exist_ok=True)
+    left.write_text("{")
+    torn.write_text(torn.read_text()[:300])  # as a file system leaves it that loses the end of a file
+    del before[torn]
+
+    again = start(tmp_path, *sweep)
+    assert again.wait(200) == 0, (tmp_path / "err").read_text()
+    after = results(tmp_path)
+    combinations = [asked(p) for p in after]
+    assert sorted(combinations) == [(m, s) for m in ("opencv", "paper") for s in range(3)], "none lost, none doubled"
+    assert len({result_files.read_result(p)["key"] for p in after}) == 6
+    assert seen(before) == before, "what was finished is untouched"
+    files = {p.name for p in tmp_path.joinpath("sweep").rglob("*") if p.is_file() and not is_private(p)}
+    assert files == {"result.json", "multirun.yaml", "sweep.csv"} and not left.exists()
+    n = len(before)
+    assert f"6 jobs: {6 - n} finished, {n} left untouched, 0 failed" in (tmp_path / "out").read_text()
+
+
+@pytest.mark.slow
+def test_an_interrupted_sweep_says_how_to_go_on(tmp_path, command, monkeypatch):
+    real, calls = job.run, []
+
+    def interrupted(*args, **options):
+        calls.append(1)
+        if len(calls) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return real(*args, **options)
+
+    monkeypatch.setattr(job, "run", interrupted)
+    code, _, err = command("-m", *SIX)
+    assert code == 130 and "Traceback" not in err and "interrupted" in err
+    before = seen(results(tmp_path))
+    assert len(before) == 2
+    for path in before:
+        config = result_files.read_result(path)["config"]
+        assert "output" not in config and "hydra" not in config
+    program, *words = shlex.split(err.strip().splitlines()[-1])
+    assert program == "dhtorch"
+    code, out, err = command(*words)
+    assert code == 0 and "6 jobs: 4 finished, 2 left untouched, 0 failed" in out, err
+    assert seen(before) == before and len({asked(p) for p in results(tmp_path)}) == len(results(tmp_path)) == 6
+
+
+def test_an_interrupted_job_writes_nothing(tmp_path, command, monkeypatch):
+    monkeypatch.setattr(result_files, "write_result", lambda *_: signal.raise_signal(signal.SIGINT))
+    code, _, err = command(*TINY)
+    assert code == 130 and "resume=true output=outputs/" in err and not results(tmp_path)
+
+
+def test_an_unforeseen_error_is_one_failed_job(command, monkeypatch):
+    monkeypatch.setattr(job, "run", lambda *_, **__: 1 / 0)
+    code, out, err = command("-m", *TINY, "seed=0,1")
+    assert code == 1 and "0 finished, 0 left untouched, 2 failed" in out
+    assert "Traceback" in err and "failed: seed=0: ZeroDivisionError: division by zero" in err
+
+
+@pytest.mark.slow
+def test_a_finished_job_is_done_again_where_it_is_another_question(command, tmp_path):
+    """Words behind ``resume=true``, what is printed, and the number of results; the data are changed in between."""
+    room = SyntheticRoom(hw=(60, 80), n_frames=3, supersample=1, lidar="exact")
+    for name in ("set", "sets/set", "changed/set"):
+        writers.write_counted_frames(tmp_path / name, list(room))
+    image = next((tmp_path / "changed").rglob("*.png"))
+    image.write_bytes(image.read_bytes() + b"\0")
+    small = ["pairs.gap=2", "method.n=256", "figures=false"]
+    of = lambda root: ["data=auto", f"data.root={tmp_path / root}", *small, "output=there"]  # noqa: E731
+    for words, said, n in (
+        (TINY, "wrote", 1),
+        ([*TINY, "batch=1"], "wrote", 2),  # in a folder of its own
+        ([*TINY, "traceback=true", "workers=0"], "left untouched", 2),
+        ([*TINY, "seed=1"], "wrote", 3),
+        ([*TINY, "output=here"], "wrote", 4),
+        ([*TINY, "output=here", "holdout.truth=raw"], "wrote", 4),
+        ([*TINY, "output=here", "data.depth_noise=2"], "wrote", 4),
+        (of("set"), "wrote", 5),
+        (of("sets/set"), "left untouched", 5),
+        (of("changed/set"), "wrote", 5),
+    ):
+        code, out, err = command("resume=true", *words)
+        assert code == 0 and said in out and len(results(tmp_path)) == n, (words, out, err)
+    assert {p.relative_to(tmp_path).parts[0] for p in results(tmp_path)} == {"outputs", "here", "there"}
+    result = result_files.read_result(tmp_path / "there")
+    assert result["config"]["data"]["root"] == "set", "no place of this machine"
+    files = result_files.list_files_below([(tmp_path / "changed/set", None)])
+    assert result["data"]["digest"] == result_files.compute_data_digest(files)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launch", [[], ["launch=joblib", "hydra.launcher.n_jobs=2"]])
+def test_a_failing_job_stops_no_other_and_any_launcher_resumes_them(command, tmp_path, launch):
+    if launch:
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    sweep = ["-m", "resume=true", *TINY, "pairs.gap=2,9,1"]
+    assert start(tmp_path, *sweep, *launch).wait(200) == 1
+    err = (tmp_path / "err").read_text()
+    assert "3 jobs: 2 finished, 0 left untouched, 1 failed" in (tmp_path / "out").read_text()
+    assert "failed: pairs.gap=9: pairs.gap: found 9" in err and "Traceback" not in err and "Warning" not in err
+    before = seen(results(tmp_path))
+    assert len(before) == 2 and all("resumed" in str(p) for p in before)
+    assert not list(tmp_path.rglob("*gap=9*")), "no empty folder of the failed job"
+    code, out, _ = command(*sweep)
+    assert code == 1 and "3 jobs: 0 finished, 2 left untouched, 1 failed" in out and seen(before) == before
+
+
+def test_a_broken_launcher_says_how_to_go_on(command, monkeypatch):
+    def die(*_args):
+        raise RuntimeError("a worker process was killed")
+
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.multirun", die)
+    code, out, err = command("-m", *TINY, "seed=0,1")
+    assert code == 1 and out == "" and "a worker process was killed" in err
+    assert "Finished jobs are kept. To run the rest:\n  dhtorch " in err
+    words = shlex.split(err.strip().splitlines()[-1])
+    assert {"-m", "resume=true", "seed=0,1", *TINY} <= set(words) and any(w.startswith("output=") for w in words)
+
+
+@pytest.mark.parametrize("name", [p.stem for p in (config_dir() / "launch").glob("*.yaml")])
+def test_launchers_compose(name):
+    plugin = f"hydra_plugins.{LAUNCHERS[name]}" if LAUNCHERS[name] else "hydra"
+    pytest.importorskip(plugin)
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        cfg = hydra.compose("run", [f"launch={name}", "output=x"], return_hydra_config=True)
+    launcher = OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
+    own = OmegaConf.to_container(OmegaConf.load(config_dir() / "launch" / f"{name}.yaml"))
+    wanted = own.get("hydra", {}).get("launcher", {})
+    assert launcher["_target_"].startswith(f"{plugin}.") and launcher | wanted == launcher and "launch" not in cfg
+
+
+@pytest.mark.slow
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.text(min_size=1), min_size=2, max_size=2, unique=True))
+def test_names_of_jobs_are_safe_short_and_different(texts):
+    names = [job_name(t) for t in texts]
+    assert names[0] != names[1]
+    for name in names:
+        assert re.fullmatch(r"[\w.,=+~@-]{1,120}", name, re.ASCII) and name not in (".", "..")
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("method=paper,seed=0", "method=paper,seed=0"),
+        ("", "defaults"),
+        ("data.hw=[120,160],seed=0", "data.hw=120,160,seed=0-"),
+        ("data.root=/sets/tum", "data.root=tum"),
+    ],
+)
+def test_names_of_jobs_can_be_read(monkeypatch, text, name):
+    monkeypatch.setenv("DHTORCH_DATA", "/sets/")
+    assert job_name(text)[: len(name)] == name and len(job_name(text)) == len(name) + 8 * name.endswith("-")
+
+
+@pytest.mark.parametrize("asked", [[], ["always"]])
+def test_only_our_own_warnings_are_seen(monkeypatch, asked):
+    monkeypatch.setattr(sys, "warnoptions", asked)
+    modules = ["torch.nn", "hydra.main", "dhtorchy", "dhtorch.pipeline.pair"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with console.show_warnings_in_a_line():
+            for module in modules:
+                warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
+    assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pipeline.pair"])

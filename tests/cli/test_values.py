@@ -15,14 +15,11 @@ from support.stub_recordings import recording
 from dhtorch.cli import (
     align,
     complete,
-    completed_folder,
     enrich,
-    enrich_page,
     inspect,
     option_checks,
     pin,
     process_capture,
-    recover_page,
     run,
     scale,
     stream,
@@ -35,7 +32,8 @@ from dhtorch.extract import plan
 from dhtorch.extract.enriched import map_columns
 from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.viz.plots import format_capture_name
+from dhtorch.viz.plots import colours, format_capture_name
+from dhtorch.viz.plots.maps import Scale
 
 MOVED, STILL, UNKNOWN = PinVerdict.MOVED, PinVerdict.NOT_MOVED, PinVerdict.CANNOT_KNOW
 
@@ -53,7 +51,7 @@ def codes_of(numbers, pixels):
 def camera(pixels, no_answer, sigma_rel=()):
     sources = (Source.NONE, Source.SENSOR, Source.RECOVERED, Source.SWEPT, Source.FILLED)
     bins = LogHistogram.of(np.array(sigma_rel)).pack()
-    reasons = codes_of(enrich_page.NO_ANSWER_REASONS, no_answer)
+    reasons = codes_of(enrich.NO_ANSWER_REASONS, no_answer)
     return {"pixels": codes_of(sources, pixels), "no_answer": reasons, "recovered_sigma_rel_bins": bins}
 
 
@@ -61,13 +59,13 @@ LEFT = camera({Source.SENSOR: 10, Source.SWEPT: 5, Source.NONE: 5}, {Gate.NO_TRA
 RIGHT = camera(
     {Source.SENSOR: 30, Source.RECOVERED: 2, Source.FILLED: 3, Source.NONE: 45}, {Gate.NO_TRACK: 45}, [0.1] * 2
 )
-CAMERAS = enrich_page.summarise_cameras([{"cameras": {"left": LEFT, "right": RIGHT}}, {"cameras": {"left": RIGHT}}])
+CAMERAS = enrich._summarise_cameras([{"cameras": {"left": LEFT, "right": RIGHT}}, {"cameras": {"left": RIGHT}}])
 OVER_TIME = [{"cameras": {"a": {"x": [[0.0, 1.0], [1.0, 0.0]]}}}, {"cameras": {"a": {"x": [[1.0, 1.0]] * 3}}}]
 
 
 def refuted(**readings):
     made = {"refuted": {name.replace("_", " "): n for name, n in readings.items()}, "frames": 9}
-    return enrich_page.describe_refuted_poses([{"cameras": {"a": made}}])
+    return enrich.describe_refuted_poses([{"cameras": {"a": made}}])
 
 
 X = torch.tensor([[[2.0, 4.0, 5.0, 4.0]]])
@@ -115,7 +113,7 @@ def interval(low, high):
 
 def limited(name, *rows, windows=()):
     """A limited quantity of a recording with these rows; a pair is the interval of its scale."""
-    made = validate.RecordingValidation(None, None)
+    made = validate._RecordingValidation(None, None)
     for given in rows:
         row = {"scale": given and interval(*given)} if given is None or isinstance(given, tuple) else given
         blank = dict.fromkeys(("scale", "scale_vs_trajectory", "shift", "tilt", "wrong", "clip_depth"))
@@ -157,8 +155,8 @@ def exceeded(limits, **values):
 
 IMAGE = torch.tensor([[0.0, 1.0, 0.5, 0.5], [1.0, 0.0, 0.5, 0.5]]).expand(1, 3, 2, 4)
 FRAME = Frame(IMAGE, torch.ones(1, 2, 4), Camera(torch.ones(1, 2), torch.ones(1, 2)))
-TUM = completed_folder.FRAME_LAYOUTS["tum"]
-PNG = completed_folder.Layout("png", 1e-3, confidence=True, budget=True)
+TUM = complete.FRAME_LAYOUTS["tum"]
+PNG = complete.Layout("png", 1e-3, confidence=True, budget=True)
 CLIP = recording(3, numbers=[4, 7, 9], times=torch.tensor([0.5, 1.25, 2.0]).double()).recording
 REGULAR = recording(3, times=torch.tensor([0.0, 0.1, 0.2]).double(), rate_hz=10.0).recording
 POSED = Pose(torch.eye(3).double().expand(2, 3, 3), torch.zeros(2, 3).double())
@@ -169,7 +167,7 @@ def chosen(format, wanted="auto", unit=None, same=True, sparse=False):
     """Name and step of the layout for a recording with poses and times."""
     made = recording(2, poses=POSED, times=torch.arange(2).double(), sparse=sparse).recording
     object.__setattr__(made, "format", format)
-    layout = completed_folder.select_layout(made, wanted, unit, same=same)
+    layout = complete.select_layout(made, wanted, unit, same=same)
     return layout.name, layout.unit
 
 
@@ -181,11 +179,11 @@ def recovered(**measured):
     """The sentence on what was recovered, and the numbers of the page."""
     none = {} if measured else {"recovered": 0.0}
     parts = {name: value | none if none and value else value for name, value in {**SHARED, **COUNTED}.items()}
-    stats = recover_page.RecoveryStats(3, **parts, **measured)
+    stats = complete.RecoveryStats(3, **parts, **measured)
     scene = recording(3)
     task = SimpleNamespace(scene=scene, recording=scene.recording)
-    sentence = recover_page.describe_recovery(task, stats, (4, 6), SimpleNamespace(findings=(), poses=None))[1]
-    return sentence, list(recover_page.build_opening([], stats, b"", "").numbers.items())
+    sentence = process_capture.describe_recovery(task, stats, (4, 6), SimpleNamespace(findings=(), poses=None))[1]
+    return sentence, list(process_capture.build_opening([], stats, b"", "").numbers.items())
 
 
 LOG = np.log(2.0) + np.array([0.1, 0.2, 0.3, -0.1, -0.1])
@@ -207,6 +205,9 @@ WHOLE = plan.make_plan(SCENES, 1, 1, rigs=True)
 SHARDS = enrich._group_shards(WHOLE.shards(2, apart=True), WHOLE, [0, 1])
 ITEMS = ["left", "right", "1"]
 GREY = torch.full((1, 4, 5), 51, dtype=torch.uint8)
+SPARSE = torch.zeros(6, 6).index_put((torch.tensor([0, 1]), torch.tensor([1, 0])), torch.tensor([3.0, 2.0]))
+SCALE = Scale("", "turbo", 2.0, 4.0, log=False)
+BLANK = (np.array(colours.parse_rgb(colours.PICTURE)) / 255).tolist()
 
 # ----------------------------------------------------------------------------------------------------------- the table
 
@@ -219,10 +220,10 @@ VALUES = [
     (lambda: list(CAMERAS[0].reasons.values()), approx([0.49, 0.01])),
     (lambda: [c.sigma_rel for c in CAMERAS], approx([0.02, 0.1], rel=0.03)),
     (lambda: next(iter(CAMERAS[1].format_kinds().values()))[:20], "2.5% (median sigma 1"),
-    (lambda: enrich_page._pixel_shares([{"pixels": [], "no_answer": []}])[0]["no_answer"], 1.0),
+    (lambda: enrich._pixel_shares([{"pixels": [], "no_answer": []}])[0]["no_answer"], 1.0),
     (lambda: [CAMERAS[0]._replace(kinds={"recovered": x}, sigma_rel=y).format_kinds()["recovered"] for x, y in ((0.1, math.nan), (0.0, 0.02))],
      ["10.0%", "0.0%"]),
-    (lambda: [*enrich_page._average_over_episodes(OVER_TIME, "x")[0][1].T.tolist()], [[0.5, 1.0], [0.75, 0.75], [1.0, 0.5]]),
+    (lambda: [*enrich._average_over_episodes(OVER_TIME, "x")[0][1].T.tolist()], [[0.5, 1.0], [0.75, 0.75], [1.0, 0.5]]),
     (lambda: refuted(the_inverse=3), ["a: the input poses contradict the near returns in 3 of 9 frames; they fit as the inverse"]),
     (lambda: refuted(the_inverse=3, unknown=1)[0][-33:], "4 of 9 frames; they fit as the inverse (3)"[-33:]),
     (lambda: refuted(unknown=1)[0][-27:], "s; no known convention fits"[-27:]),
@@ -286,7 +287,7 @@ VALUES = [
     (lambda: printed(1.5, 1.3)[-2], "  maps are 1.500 times the sensor's depth; the poses agree with neither, so which is wrong cannot be determined"),
     (lambda: [len(printed(*x)) for x in ((1.02, 1.0), (1.5, 1.0))], [4, 5]),
     # complete
-    (lambda: completed_folder.count_pixels({"pixels": {"sensor": 1, "swept": 2, "none": 1, "recovered": 4, "filled": 3}}),
+    (lambda: complete.count_pixels({"pixels": {"sensor": 1, "swept": 2, "none": 1, "recovered": 4, "filled": 3}}),
      {"recovered": 6, "filled": 3, "sensor": 1, "no_answer": 1}),
     (lambda: complete.resize_picture(FRAME, (1, 2)).tolist(), [[[128] * 3] * 2]),
     (lambda: [*complete.resize_picture(FRAME, (2, 4))[..., 1].tolist()], [[0, 255, 128, 128], [255, 0, 128, 128]]),
@@ -297,11 +298,11 @@ VALUES = [
     (lambda: [chosen(f) for f in ("tum", "stray", "replica")], [("tum", 2e-4), ("stray", 1e-3), ("frames", 1e-3)]),
     (lambda: [chosen("driving", sparse=True), chosen("driving", sparse=True, unit=0.002)], [("frames", 0.005), ("frames", 0.002)]),
     (lambda: chosen("tum", same=False), ("frames", 1e-3)),
-    (lambda: [completed_folder._find_lack("tum", REGULAR, same) for same in (True, False)], [None, "has images larger than its maps (see size=)"]),
-    (lambda: completed_folder._find_lack("tum", recording(2).recording, True), "has no time stamps"),
-    (lambda: [completed_folder._find_lack("frames", r, True) for r in (REGULAR, recording(2, poses=LOST).recording)], ["has no pose for every frame"] * 2),
-    (lambda: completed_folder._find_lack("frames", recording(2, poses=POSED).recording, True), None),
-    (lambda: completed_folder._find_lack("stray", REGULAR, True), "is a made recording, not a Stray Scanner capture"),
+    (lambda: [complete._find_lack("tum", REGULAR, same) for same in (True, False)], [None, "has images larger than its maps (see size=)"]),
+    (lambda: complete._find_lack("tum", recording(2).recording, True), "has no time stamps"),
+    (lambda: [complete._find_lack("frames", r, True) for r in (REGULAR, recording(2, poses=LOST).recording)], ["has no pose for every frame"] * 2),
+    (lambda: complete._find_lack("frames", recording(2, poses=POSED).recording, True), None),
+    (lambda: complete._find_lack("stray", REGULAR, True), "is a made recording, not a Stray Scanner capture"),
     # dhtorch PATH
     (lambda: process_capture._pick_evenly(list(range(10)), 2), [2, 7]),
     (lambda: process_capture._pick_evenly([3, 4], 5), [3, 4]),
@@ -324,8 +325,9 @@ VALUES = [
     (lambda: [verdict(*[STILL] * 3, *[UNKNOWN] * 3), verdict(*[STILL] * 2, *[UNKNOWN] * 3)], [STILL, UNKNOWN]),
     (lambda: [verdict(MOVED, STILL), verdict(*[STILL] * 5, changes=[3])], [STILL, MOVED]),
     (lambda: [pin._to_rgb(x.expand(n, -1, -1)).tolist() for x in (GREY, GREY / 255) for n in (1, 3)], [[[[51] * 3] * 5] * 4] * 4),
-    (lambda: inspect._depth_limits(torch.tensor([2.0, 2.0])), (2.0, approx(2.001))),
-    (lambda: inspect._nearest_per_block(torch.tensor([[[0.0, 3.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]]]), 2).tolist(), [[[2.0, 0.0]]]),
+    (lambda: inspect._paint_tile(SPARSE, SCALE, 1.0).tolist(), [[SCALE.paint(np.array([[2.0]]), np.ones((1, 1), bool))[0, 0].tolist(), BLANK], [BLANK] * 2]),
+    (lambda: [inspect._paint_tile(SPARSE, SCALE, x).shape for x in (2.0, 0.5)], [(4, 2, 3), (2, 4, 3)]),
+    (lambda: [inspect._paint_tile(x, None, 1.0)[2, 2].tolist() for x in (GREY, GREY.expand(3, -1, -1))], [approx([0.2] * 3)] * 2),
     (lambda: [view._select_item(ITEMS, wanted, str) for wanted in (None, "right", 0, 1)], ["left", "right", "left", "1"]),
     # options and errors
     (lambda: rule("planes", 1, 2, 2.5, True), [False, True, False, False]),
@@ -435,7 +437,7 @@ def test_windows_cover_the_validated_frames_and_are_of_one_size(monkeypatch, n, 
     options = {"every": 1, "max_frames": None, "window": 4, "seed": 5, "pictures": 0, "steps": [1], "views": True}
     options |= {"source_views": 2, "size": 96, "tolerance": 0.025, **settings}
     progress = lambda items, text, count: texts.append((text, count)) or items  # noqa: E731
-    validation = validate._validate_recording(validate.RecordingValidation(scene, maps), None, options, progress)
+    validation = validate._validate_recording(validate._RecordingValidation(scene, maps), None, options, progress)
     assert [(*row["frames"], row["cause"]) for row in validation.windows] == windows
     numbers = range(20, 20 + n)[:: options["every"]][: options["max_frames"]]
     assert [row["frame"] for row in validation.rows] == [*numbers]
@@ -451,7 +453,7 @@ def test_windows_cover_the_validated_frames_and_are_of_one_size(monkeypatch, n, 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 40, 64, 100, 777])
 def test_any_first_part_of_an_order_is_spread_evenly(n):
-    order = process_capture.order_evenly(n)
+    order = process_capture._order_evenly(n)
     assert sorted(order) == list(range(n)) and order[:3] == list(dict.fromkeys([n // 2, 0, n - 1][: 3 * n]))[:n]
     for k in range(4, n):
         done = np.array(sorted(order[:k]))
@@ -467,8 +469,8 @@ def test_recovery_is_averaged_over_frames_of_their_own_size(monkeypatch):
     depth = np.linspace(1, 2, 101)
     maps = {"depth": np.append(depth, [9.0, 0.0]), "sigma": 0.1 * np.append(depth**2, [1.0, 1.0])}
     source = np.array([Source.SWEPT] * 101 + [Source.SENSOR, Source.SWEPT])
-    monkeypatch.setattr(recover_page.completed, "read_completed_maps", lambda *_: (maps, source))
-    stats = recover_page.measure_recovery(SimpleNamespace(name=str, done=rows), [0, 1])
+    monkeypatch.setattr(complete, "read_completed_maps", lambda *_: (maps, source))
+    stats = complete.measure_recovery(SimpleNamespace(name=str, done=rows), [0, 1])
     assert [stats.frames, stats.near, stats.far, stats.error] == approx([2, 1.02, 1.98, 0.15])
     assert stats.fractions == approx({"recovered": 0.25, "filled": 0.125, "sensor": 0.375, "no_answer": 0.25})
     assert stats.pixels == {"recovered": 17.5, "filled": 5, "sensor": 30, "no_answer": 17.5}

@@ -16,7 +16,7 @@ from support.robot_episodes import three_episodes
 from support.writers import write_rlds
 
 from dhtorch import data
-from dhtorch.cli import inspect
+from dhtorch.cli import run
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.io.decode import FormatError
@@ -214,6 +214,6 @@ def test_every_record_of_the_bridge_set_is_whole() -> None:
 
 @needs_data
 def test_the_bridge_set_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert inspect.main([str(ROOT), "--max-frames", "2", "--out", str(tmp_path)]) == 0
+    assert run.main(["inspect", str(ROOT), "--max-frames", "2", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "rlds" in said and "no intrinsics" in said and "64x64" in said

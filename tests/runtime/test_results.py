@@ -1,26 +1,32 @@
 """Result files: schema, strictness, atomic writing, and the key that decides whether a job is done."""
 
+import ast
+import contextlib
 import copy
 import json
 import math
-import multiprocessing
 import os
+import shutil
 import stat
 import subprocess
 import sys
 import time
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache
 from pathlib import Path
 
+import hydra
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from support.byte_damage import change_middle
 from support.small_result import KEY, result
 
+import dhtorch
+from dhtorch.cli.run import config_dir, job_name
+from dhtorch.runtime import code_dependencies, storage
 from dhtorch.runtime import results as result_files
-from dhtorch.runtime import storage
 from dhtorch.runtime.output_folder import open_output_folder
 
 MISSING = object()
@@ -254,69 +260,30 @@ def test_a_failed_write_leaves_the_old_file_and_a_replaced_one_is_whole_and_read
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
 
 
-def write_for_ever(path, ready):
-    one = result_files.read_result(path)
-    one["rows"] = one["rows"] * 200
-    while True:
-        result_files.write_result(path, one)
-        ready.set()
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_killed_writer_leaves_a_whole_file(tmp_path):
-    path = result_files.write_result(tmp_path / "result.json", result())
-    context = multiprocessing.get_context("fork")
-    ready = context.Event()
-    writer = context.Process(target=write_for_ever, args=(path, ready))
-    writer.start()
-    try:
-        assert ready.wait(60)
-        for _ in range(20):
-            assert len(result_files.read_result(path)["rows"]) == 400  # read while it is being replaced
-    finally:
-        writer.kill()
-        writer.join()
-    assert result_files.is_finished(path, KEY)
-
-
-def is_folder(handle):
-    return stat.S_ISDIR(os.fstat(handle).st_mode)
-
-
-def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
-    """Content, then name, then the folder that holds the name; until then it lies beside under another one."""
+@pytest.mark.parametrize("refused", ["", "sync", "open"])
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch, refused):
+    """Content, then name, then the folder that holds the name; a system that cannot sync or open a folder is no error."""
     log, sync, replace, real_open = [], os.fsync, storage.Path.replace, os.open
 
     def synced(handle):
-        log.append("folder" if is_folder(handle) else os.fstat(handle).st_size)
-        sync(handle)
+        is_folder = stat.S_ISDIR(os.fstat(handle).st_mode)
+        log.append("folder" if is_folder else os.fstat(handle).st_size)
+        return refuse() if is_folder and refused == "sync" else sync(handle)
+
+    def opened(path, *args, **options):
+        is_refused = refused == "open" and Path(path).is_dir() and not args[0] & os.O_CREAT
+        return refuse() if is_refused else real_open(path, *args, **options)
 
     def renamed(self, target):
         log.append((self.parent == target.parent, self.name.startswith(".a.bin."), self.name.endswith(".tmp")))
         return replace(self, target)
 
-    monkeypatch.setattr(storage.os, "fsync", synced)
-    monkeypatch.setattr(storage.Path, "replace", renamed)
-    storage.replace_file(tmp_path / "a.bin", b"seven b")
-    assert log == [7, (True, True, True), "folder"]
-
-    # A system that cannot sync or open a folder is no error
-    def no_sync(handle):
-        if is_folder(handle):
-            log.append(handle)
-            raise OSError("not supported")
-
-    def no_open(path, *args, **options):
-        if Path(path).is_dir() and not args[0] & os.O_CREAT:
-            raise OSError("no folders")
-        return real_open(path, *args, **options)
-
-    monkeypatch.setattr(storage.os, "fsync", no_sync)
-    assert storage.replace_file(tmp_path / "a", b"x").read_bytes() == b"x"
-    with pytest.raises(OSError, match="Bad file descriptor"):
-        os.fstat(log[-1])
-    monkeypatch.setattr(storage.os, "open", no_open)
-    assert storage.replace_file(tmp_path / "a", b"y").read_bytes() == b"y"
+    for place, name, function in ((os, "fsync", synced), (os, "open", opened), (storage.Path, "replace", renamed)):
+        monkeypatch.setattr(place, name, function)
+    n_open = len([*Path("/proc/self/fd").iterdir()])
+    assert storage.replace_file(tmp_path / "a.bin", b"seven b").read_bytes() == b"seven b"
+    assert log == [7, (True, True, True), "folder"][: 3 - (refused == "open")]
+    assert len([*Path("/proc/self/fd").iterdir()]) == n_open, "every file is closed"
 
 
 def test_a_copy_has_the_bytes_of_its_source(tmp_path):
@@ -515,46 +482,44 @@ def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch, settin
 
 
 def test_metadata_hold_what_is_given_and_what_is_installed(monkeypatch):
-    collect = partial(result_files.collect_run_metadata, device="cuda:1", threads=3, seed=11, operators="torch")
-    meta = collect(dtype=torch.float64)
-    assert [meta[name] for name in ("device", "dtype", "threads", "seed")] == ["cuda:1", "float64", 3, 11]
-    names = {"python", "dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core"}
-    assert names == set(meta["versions"]) and meta["versions"]["numpy"] == np.__version__
-    assert meta["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
-    when = datetime.fromisoformat(meta["utc"])
-    assert abs((datetime.now(UTC) - when).total_seconds()) < 60 and when.microsecond == 0
-    assert meta["utc"].endswith("+00:00")
-
-    def absent(name):
-        raise result_files.importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(result_files.importlib.metadata, "version", absent)
-    versions = collect(dtype="x")["versions"]
-    assert versions["torch"] is None and versions["python"]
+    given = {"device": "cuda:1", "threads": 3, "seed": 11, "operators": "torch"}
+    meta = result_files.collect_run_metadata(**given, dtype=torch.float64)
+    assert given.items() <= meta.items() and meta["dtype"] == "float64"
+    assert {k: meta["versions"][k] for k in ("numpy", "python")} == {
+        "numpy": np.__version__,
+        "python": ".".join(map(str, sys.version_info[:3])),
+    }
+    assert {"dhtorch", "torch", "kornia", "opencv-python-headless", "hydra-core"} <= meta["versions"].keys()
+    assert 0 <= (datetime.now(UTC) - datetime.fromisoformat(meta["utc"])).total_seconds() < 60
+    absent = result_files.importlib.metadata.PackageNotFoundError("torch")
+    monkeypatch.setattr(result_files.importlib.metadata, "version", lambda _: (_ for _ in ()).throw(absent))
+    assert result_files.collect_run_metadata(**given, dtype="x")["versions"]["torch"] is None
 
 
 def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
     """A package in a folder of its own under version control, outside of it, and without git."""
-    package = tmp_path / "package"
-    write(package / "__init__.py", "")
-    commit = partial(result_files.read_git_revision, package)
+    file = write(tmp_path / "package" / "__init__.py", "")
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    assert commit() is None
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    run = partial(subprocess.run, check=True, capture_output=True, text=True)
-    run([*git, "init", "-q"])
-    assert commit() is None, "in a repository, but not of it"
-    run([*git, "add", "package"])
-    run([*git, "commit", "-q", "-m", "x"])
-    clean = commit()
-    assert len(clean) >= 7 and run([*git, "rev-parse", "HEAD"]).stdout.startswith(clean)
-    write(package / "__init__.py", "x = 1\n")
-    assert commit() == f"{clean}-dirty"
-    run([*git, "commit", "-q", "-a", "-m", "y"])
-    run([*git, "tag", "v7"])
-    assert commit() == "v7"
+    commits = []
+    for words in (
+        ["init", "-q"],
+        ["add", "package"],
+        ["commit", "-q", "-m", "x"],
+        None,
+        ["commit", "-qam", "y"],
+        ["tag", "v7"],
+    ):
+        commits.append(result_files.read_git_revision(file.parent))
+        if words is None:
+            write(file, "x = 1\n")
+        else:
+            subprocess.run([*git, *words], check=True, capture_output=True)
+    first = commits[3]
+    assert commits[:2] == [None] * 2 and len(first) >= 7 and commits[4] == f"{first}-dirty"
+    assert commits[5] != first and result_files.read_git_revision(file.parent) == "v7"
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert commit() is None
+    assert result_files.read_git_revision(file.parent) is None
 
 
 HERE = {"key": "a", "config": {"n": 1}, "data": {"digest": "d"}, "git": "v1", "version": "0"}
@@ -586,3 +551,136 @@ def test_a_folder_of_another_run_is_refused(tmp_path, content, here, message):
     with pytest.raises(FileExistsError, match=message) as refused:
         result_files.check_same_run(tmp_path, file, HERE | here, "complete")
     assert "\n" not in str(refused.value)
+
+
+ROOT = Path(dhtorch.__file__).parent
+MODULES = sorted(ROOT.rglob("*.py"))
+
+
+@cache
+def settings(*overrides):
+    OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        return OmegaConf.to_container(hydra.compose("run", list(overrides)), resolve=True)
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """A copy of the package that may be edited."""
+    folder = tmp_path_factory.mktemp("copy") / "dhtorch"
+    return Path(shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns("__pycache__")))
+
+
+@contextlib.contextmanager
+def edited(path):
+    """A file with a comment at its end, for as long as it is looked at."""
+    before = path.read_bytes()
+    path.write_bytes(before + b"\n# edited\n")
+    yield
+    path.write_bytes(before)
+
+
+MAIN = ("data=synthetic",)
+TABLE = "method.score.recalibration={_target_: dhtorch.metrics.calibration.load_probability, name: map}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "path", "counts"),
+    [
+        (MAIN, "stages/track.py", True),
+        (MAIN, "stages/fuse.py", True),
+        (MAIN, "geometry/se3.py", True),
+        (MAIN, "pipeline/pair.py", True),  # imported when a method is called
+        (MAIN, "synthetic/room.py", True),
+        (MAIN, "experiments/protocol.py", True),
+        (MAIN, "metrics/risk.py", True),
+        (MAIN, "viz/viewer/exhibit.py", False),
+        (MAIN, "viz/viewer/html.py", False),
+        (MAIN, "experiments/negative/icp.py", False),
+        (MAIN, "extract/dataset.py", False),
+        (MAIN, "experiments/report/page.py", False),
+        (MAIN, "cli/run.py", False),
+        (MAIN, "metrics/calibration/map.json", False),
+        ((*MAIN, "experiment=icp"), "experiments/negative/icp.py", True),
+        ((*MAIN, "experiment=icp"), "experiments/paper/heldout.py", False),
+        ((*MAIN, "method=opencv"), "experiments/baselines/opencv.py", True),
+        (MAIN, "experiments/baselines/opencv.py", False),
+        ((*MAIN, TABLE), "metrics/calibration/map.json", True),  # which travels with its module
+        ((*MAIN, "root:dhtorch.extract.dataset"), "extract/dataset.py", True),
+    ],
+)
+def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrides, path, counts):
+    config = settings(*(each for each in overrides if not each.startswith("root:")))
+    roots = [each.removeprefix("root:") for each in overrides if each.startswith("root:")]
+    key = lambda: result_files.compute_result_key(config, "d", code_dir=package, roots=roots)  # noqa: E731
+    before = key()
+    with edited(package / path):
+        assert (key() != before) == counts
+    assert key() == before
+
+
+def test_a_comment_or_docstring_is_no_other_code(package):
+    path = package / "metrics" / "risk.py"
+    before = code_dependencies.digest_source(path)
+    source = path.read_text()
+    path.write_text(source.replace('"""', '"""Edited. ', 1) + "\n# edited\n")
+    assert code_dependencies.digest_source(path) == before
+    path.write_text(source + "\nEDITED = 1\n")
+    assert code_dependencies.digest_source(path) != before
+    path.write_text(source)
+
+
+def test_names_are_those_of_modules_functions_and_packages():
+    reach = lambda *names: set(code_dependencies.find_reachable_modules(names))  # noqa: E731
+    assert reach("dhtorch.codes.Gate") == reach("dhtorch.codes") == {"__init__.py", "codes.py"}
+    assert {"geometry/__init__.py", "geometry/se3.py", "pytree.py"} <= reach("dhtorch.geometry.se3.exp")
+    assert reach("dhtorch.nothing", "dhtorch.nowhere.at.all") == {"__init__.py"} and reach("nobody.knows") == set()
+    assert reach() == set() and list(code_dependencies.find_reachable_modules(["dhtorch.records"])) == sorted(
+        code_dependencies.find_reachable_modules(["dhtorch.records"])
+    )
+
+
+def test_somebody_elses_function_counts_and_what_it_takes_from_here(tmp_path, monkeypatch):
+    (tmp_path / "their_tracker.py").write_text("from dhtorch.stages import track\n\ndef follow(): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = code_dependencies.find_reachable_modules(["their_tracker.follow"])
+    assert found["elsewhere:their_tracker"] == tmp_path / "their_tracker.py"
+    assert {"stages/track.py", "geometry/lucas_kanade.py"} <= set(found) and "pipeline/multiview.py" not in found
+    config = {"track": {"_target_": "their_tracker.follow"}}
+    before = result_files.compute_result_key(config, "d")
+    with edited(tmp_path / "their_tracker.py"):
+        assert result_files.compute_result_key(config, "d") != before
+    sys.modules.pop("their_tracker", None)
+
+
+def written(path):
+    """Names that a file imports of the package, read with the grammar."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "dhtorch")
+        elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "dhtorch":
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_no_import_of_the_package_is_missed():
+    for path in MODULES:
+        found, expected = set(code_dependencies.iter_imports(path.read_text(encoding="utf-8"))), set(written(path))
+        assert expected <= found, path
+        assert not found - expected or '"""' in path.read_text(encoding="utf-8"), "an example in a docstring"
+    told = "from dhtorch.a import (\n    b,  # a note\n    c as d,\n)\n\ndef f():\n    import dhtorch.e\n    from dhtorch import g\n"
+    assert list(code_dependencies.iter_imports(told)) == [
+        "dhtorch.a",
+        "dhtorch.a.b",
+        "dhtorch.a.c",
+        "dhtorch.e",
+        "dhtorch",
+        "dhtorch.g",
+    ]
+
+
+def test_nothing_is_imported_by_a_name_that_is_made_at_run_time():
+    """Such an import would be out of reach: but of the package's own doors, and of modules that settings name."""
+    allowed = {"__init__.py", "viz/viewer/again.py", "data/io/decode.py", "cli/run.py", "cli/option_checks.py"}
+    users = {p.relative_to(ROOT).as_posix() for p in MODULES if "import_module(" in p.read_text(encoding="utf-8")}
+    assert users <= allowed

@@ -130,8 +130,9 @@ def write_result(root: Path, name: str | None) -> Path:
 def read_result(path: Path) -> None:
     """Tables on the console and as Markdown."""
     with contextlib.redirect_stdout(io.StringIO()):
-        report.main([str(path)])
-        report.main([str(path), "--markdown"])
+        for markdown in (False, True):
+            options = {"result": [path], "html": None, "markdown": markdown}
+            report.run(options, {}, progress=lambda items, *_: items)
 
 
 def write_points(root: Path) -> Path:

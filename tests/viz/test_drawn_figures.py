@@ -3,24 +3,35 @@
 ``DHTORCH_STORE=1 pytest tests/viz/test_drawn_figures.py`` stores them anew, after the images have been looked at.
 """
 
+import base64
+import gc
 import math
+import subprocess
+import sys
+import weakref
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
+from matplotlib import _pylab_helpers
 from matplotlib.figure import Figure
 from support import result_files as archived
 from support.digests import alike
 from support.drawn import describe
 from support.stored_values import stored_values
 
-from dhtorch.cli import enrich_page, scale
+from dhtorch.cli import enrich, scale
 from dhtorch.codes import Gate, Hole, Source, State, names
 from dhtorch.experiments.report import figures, jobs
+from dhtorch.pipeline.presets import METHODS
 from dhtorch.viz import plots
 from dhtorch.viz.plots import colours, maps
-from dhtorch.viz.viewer import pin
+from dhtorch.viz.plots import figures as plot_figures
+from dhtorch.viz.viewer import html as pages
+from dhtorch.viz.viewer import points, validation
 
 FILE = Path(__file__).with_name("drawn_figures.json")
 HW = (24, 32)
@@ -86,10 +97,10 @@ def cases(folder):
             file, view.image, 0 * view.depth, 0 * state, evidence * np.nan
         ),
         "strip": lambda: plots.Strip("Hall", (300, 1300), plots.fit_common_depth_axis([view])),
-        "drift": lambda: pin._draw_drift([("a", [0, 1, 2], [0.5, math.nan, 3.0]), ("b", [0], [1.0])]),
+        "drift": lambda: validation.draw_drift([("a", [0, 1, 2], [0.5, math.nan, 3.0]), ("b", [0], [1.0])]),
         "scale": lambda: scale._plot("view", [(0.0, 0.01, 0.02), (1.0, -0.03, 0.001), (2.0, math.nan, 0.0)]),
-        "enriched, over time": lambda: enrich_page._build_time_figure(episodes),
-        "enriched, reasons": lambda: enrich_page._build_reason_figure(reasons),
+        "enriched, over time": lambda: enrich._build_time_figure(episodes),
+        "enriched, reasons": lambda: enrich._build_reason_figure(reasons),
         "sweep of a number": lambda: jobs.sweep_figure(swept),
         "sweep of names": lambda: jobs.sweep_figure(named),
         **{
@@ -119,8 +130,8 @@ def test_values_are_painted_by_their_logarithm_and_a_strip_shows_them_in_their_p
     linear = maps.Scale("", colours.DEPTH_CMAP, 0.0, 1.0, log=False)
     assert np.allclose(shown[:, :4], linear.paint(np.array([[0, 0.5, 1, 1]]), np.ones((1, 4), bool)))
     assert np.allclose(255 * shown[0, 4], colours.parse_rgb(colours.PICTURE))
-    fitted = maps.fit_depth_scale(np.linspace(1.0, 3.0, 1001))
-    assert (fitted.low, fitted.high) == pytest.approx((1.02, 2.98)) and maps.fit_depth_scale(
+    fitted = maps._fit_depth_scale(np.linspace(1.0, 3.0, 1001))
+    assert (fitted.low, fitted.high) == pytest.approx((1.02, 2.98)) and maps._fit_depth_scale(
         np.full(9, 2.0)
     ).high == 2.5
     view = completed_view()
@@ -135,3 +146,115 @@ def test_values_are_painted_by_their_logarithm_and_a_strip_shows_them_in_their_p
     assert (blank == made).all(), "nothing else changes"
     pixels = np.arange(12.0).reshape(3, 4, 1)
     assert maps._resample(pixels, 3, 2)[..., 0].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]], "at pixel centres"
+
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def drawn(name="a scene"):
+    """A figure of two axes with a name from a file wherever one can stand."""
+    figure, panels = plots.make_figure(2)
+    for axes, log in zip(panels, (False, True), strict=True):
+        plots.draw_line(axes, [0, 0.5, None, 1], [0.1, 0.2, 0.3, 0.4], plots.Stroke(colours.INK, dashes=(4, 3)))
+        plots.set_axis(axes, "x", name, percent=True, limits=(0.0, 1.0))
+        plots.set_axis(axes, "y", log=log)
+        plots.set_title(axes, name)
+    plot_figures.set_rows(panels[0], [name, "b"])
+    plots.add_legend(figure, {name: plots.Stroke(colours.INK).options()})
+    return figure
+
+
+@pytest.mark.parametrize("name", ["$x_1$ and $y$", "<b>&amp;", "\x00\ud800 \n é", "部屋", "", "long " * 40])
+def test_any_name_can_stand_in_a_figure_and_an_svg_is_the_same_every_time(name):
+    made = plots.encode_uri(drawn(name))
+    assert made == plots.encode_uri(drawn(name))
+    tree = ET.fromstring(base64.b64decode(made.removeprefix("data:image/svg+xml;base64,")))
+    texts = " ".join("".join(e.itertext()) for e in tree.iter() if e.tag.endswith("text"))
+    shown = " ".join(name.encode("utf-8", "replace").decode().replace("\x00", "\ufffd").split())
+    assert shown[:10] in texts and shown in texts + shown * (len(shown) > 50), "whole, or cut"
+
+
+def test_figures_leave_nothing_behind(tmp_path):
+    before, figure = dict(mpl.rcParams), drawn()
+    plots.save_figure(figure, tmp_path / "a.png")
+    gone = weakref.ref(figure)
+    del figure
+    gc.collect()
+    assert gone() is None and dict(mpl.rcParams) == before and not _pylab_helpers.Gcf.figs
+    text = "import sys, dhtorch.viz.plots, dhtorch.experiments.report.page, dhtorch.viz.viewer.html\n"
+    text += "print([m for m in ('matplotlib', 'rich', 'PIL') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]", "importing costs no drawing library"
+
+
+def test_a_long_title_is_set_smaller_then_cut_in_its_middle():
+    _, (axes,) = plots.make_figure()
+    sizes = []
+    for n in (10, 35, 400):
+        plots.set_title(axes, f"{'x' * n}, cutoff 3 m")
+        sizes.append(axes._left_title.get_fontsize())
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] == 11 > sizes[1] > sizes[2] == 8
+    assert "…" in axes.get_title("left") and axes.get_title("left").endswith("x, cutoff 3 m")
+    assert len(axes.get_title("left")) == 62 and plot_figures.shorten("x" * 62, 62) == "x" * 62
+
+
+@pytest.mark.parametrize(
+    ("limits", "log", "percent", "expected"),
+    [
+        ((0.0, 1.0), False, True, ["0", "20", "40", "60", "80", "100"]),
+        ((2.0, 12.0), False, False, ["2", "4", "6", "8", "10", "12"]),
+        ((0.01, 1.0), True, True, ["1", "2", "5", "10", "20", "50", "100"]),
+        ((1.2, 1.9), True, False, ["1.2", "1.3", "1.4", "1.5", "1.6", "1.7", "1.8", "1.9"]),
+    ],
+)
+def test_ticks_are_round(limits, log, percent, expected):
+    _, (axes,) = plots.make_figure()
+    plots.set_axis(axes, "x", log=log, percent=percent, limits=limits)
+    ticks = [t for t in axes.xaxis.get_majorticklocs() if limits[0] * 0.999 <= t <= limits[1] * 1.001]
+    assert axes.xaxis.get_major_formatter().format_ticks(ticks) == expected
+
+
+# ---------------------------------------------------------------------------------------------------- colours
+
+
+def test_every_code_and_every_method_has_a_colour_of_its_own_and_those_of_depth_are_nobody_else_s():
+    tables = (colours.GATE_COLOURS, colours.HOLE_COLOURS, colours.METHOD_COLOURS)
+    known = (set(names(Gate)) - {Gate.ANSWER}, set(names(Hole)) - {Hole.NONE}, {*METHODS, "opencv", "auto", "xfeat"})
+    for table, codes in zip(tables, known, strict=True):
+        assert len({c.upper() for c in table.values()}) == len(table) and codes <= set(table)
+    others = {c.upper() for c in (*(c for table in tables for c in table.values()), *colours.SERIES_COLOURS)}
+    own = [colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ALIGNED, colours.FILLED]
+    assert not {*own} & others and set(colours.SOURCE_COLOURS) == set(names(Source))
+    assert colours.colour_by_source(np.array([1, 2, 3])).tolist() == [list(colours.parse_rgb(c)) for c in own[:3]]
+
+
+def test_a_method_has_the_same_colour_in_any_company():
+    alone, among = (plots.assign_strokes(each) for each in (["map"], ["mine", "map", "paper", *map(str, range(30))]))
+    assert alone["map"] == among["map"] and list(among)[:3] == ["mine", "map", "paper"]
+    assert len({among[str(k)] for k in range(23)}) == 23, "what has used up the colours is dashed"
+
+
+def test_the_viewer_draws_in_these_colours():
+    for name in pages._CMAP_OF_QUANTITY.values():
+        stops = np.array([colours.parse_rgb(c) for c in colours.sample_cmap(name)]) / 255
+        exact = mpl.colormaps[name](np.linspace(0, 1, 2 * len(stops) - 1))[:, :3]
+        assert np.abs(stops - exact[::2]).max() < 0.003
+        assert np.abs((stops[1:] + stops[:-1]) / 2 - exact[1::2]).max() < 0.06, "straight lines between them do"
+
+
+def test_a_ply_file_is_shown_with_its_colours_and_up(tmp_path):
+    head = "ply\nformat ascii 1.0\ncomment up 0 0 1\nelement vertex 3\n"
+    head += "".join(f"property float {a}\n" for a in "xyz") + "property uchar red\nproperty uchar green\n"
+    path = tmp_path / "a.ply"
+    path.write_text(head + "property uchar blue\nend_header\n1 2 3 10 20 30\n4 5 6 40 50 60\nnan 0 0 0 0 0\n")
+    (shot,) = points.read_ply_exhibit(path).shots
+    assert shot.samples["rgb"].tolist() == [[10, 20, 30], [40, 50, 60]]
+    up = shot.samples["xyz"][1] - shot.samples["xyz"][0]
+    assert np.allclose(np.linalg.norm(up), np.sqrt(27), atol=1e-5)
+    assert np.allclose(shot.samples["xyz"][:, 1], [-3, -6], atol=1e-5), "up is against the camera's y"
+    vertices = points.read_ply_vertices(path)
+    assert np.allclose(vertices.xyz[:2], [[1, 2, 3], [4, 5, 6]])
+    moved = vertices.vertex.copy()
+    moved["x"] += 1
+    path.write_bytes(vertices.encode(moved))
+    assert np.allclose(points.read_ply_vertices(path).xyz[:2], [[2, 2, 3], [5, 5, 6]])

@@ -3,7 +3,7 @@
 import base64
 import contextlib
 import copy
-import html.parser
+import html
 import importlib.util
 import io
 import itertools
@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from support.rooms import room as rendered
 
 from dhtorch import export
 from dhtorch.cli import run
-from dhtorch.codes import Gate, Source, names
+from dhtorch.codes import Gate, Hole, Source, names
 from dhtorch.data.pairs import by_choice, by_gap
 from dhtorch.experiments.exhibits import MAX_CLOUD_POINTS, MAX_SWEPT_POINTS, make_exhibit
 from dhtorch.experiments.protocol import Settings
@@ -40,6 +41,15 @@ from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz import viewer
 from dhtorch.viz.viewer import again, points, rrd
 from dhtorch.viz.viewer import html as pages
+from dhtorch.viz.viewer.exhibit import (
+    EMPTY_CLOUD,
+    DepthImage,
+    Exhibit,
+    ExhibitView,
+    PairExhibit,
+    PointCloud,
+    SweptPointCloud,
+)
 
 CUTOFF, N = 2.0, 700
 HOSTILE = "</script><script>document.title='taken'</script><!-- & \u2028 ' \" ünï"
@@ -82,22 +92,19 @@ def command(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_result_finds_its_data_wherever_it_is_and_is_called_from(command, tmp_path, monkeypatch):
     room = SyntheticRoom(hw=(60, 80), n_frames=3, lidar="exact", supersample=1)
-    writers.write_counted_frames(tmp_path / "capture", [room[i] for i in range(3)])
+    writers.write_counted_frames(tmp_path / "capture", list(room))
     options = ["data=auto", "data.root=capture", "pairs.gap=2", "method.n=256", "holdout=none", "figures=false"]
-    code, _, err = command(*options, "output=job")
-    assert code == 0, err
-    place = tmp_path / "far" / "away"
+    assert command(*options, "output=job")[0] == 0
+    place, moved = tmp_path / "far" / "away", tmp_path / "moved"
     place.mkdir(parents=True)
     (tmp_path / "job").rename(place / "job")
     monkeypatch.chdir(place)
     monkeypatch.delenv("DHTORCH_DATA", raising=False)
-    code, _, err = command("view", "job", "html=page.html")
-    assert code == 0 and "alone" not in err and (place / "page.html").stat().st_size > 1000, err
-    (tmp_path / "capture").rename(tmp_path / "moved")
-    code, _, err = command("view", "job", "html=lost.html")
-    assert code == 2 and "root=PATH" in err and not (place / "lost.html").exists(), err
-    code, _, err = command("view", "job", f"root={tmp_path / 'moved'}", "html=found.html")
-    assert code == 0 and (place / "found.html").is_file(), err
+    for words, ends, said in (([], 0, ""), ([], 2, "root=PATH"), ([f"root={moved}"], 0, "")):
+        code, _, err = command("view", "job", "html=page.html", *words)
+        assert code == ends and said in err and "alone" not in err and (code or Path("page.html").stat().st_size > 1000)
+        Path("page.html").unlink(missing_ok=True)
+        moved.exists() or (tmp_path / "capture").rename(moved)
 
 
 def test_every_sample_has_one_fate(scene):
@@ -183,30 +190,11 @@ def test_of_many_pairs_some_are_shown():
 # ------------------------------------------------------------------------------------------------------------ the page
 
 
-class Tags(html.parser.HTMLParser):
-    """Scripts with their text, and every address that is asked for."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.scripts, self.addresses, self.inside = [], [], False
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.addresses += [v for k, v in attrs if k in ("src", "href", "srcset", "action")]
-        self.inside = tag == "script"
-        if self.inside:
-            self.scripts.append("")
-
-    def handle_endtag(self, tag):
-        self.inside = False
-
-    def handle_data(self, data):
-        if self.inside:
-            self.scripts[-1] += data
+SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.DOTALL)
 
 
 def data_of(page):
-    return json.loads(Tags(page).scripts[0])
+    return json.loads(SCRIPT.search(page)[1])
 
 
 def unpacked(packed):
@@ -215,12 +203,11 @@ def unpacked(packed):
 
 def test_the_page_is_whole_and_small(scene):
     page = pages.build_viewer_page(scene)
-    found = Tags(page)
-    assert len(found.scripts) == 2 and not found.addresses
-    code = len(page) - len(found.scripts[0])
-    assert code < 100_000, "under a tenth of a megabyte beside the data"
+    data, code = SCRIPT.findall(page)
+    assert not re.search(r"\b(src|href|srcset|action)=", SCRIPT.sub("", page)), "no address is asked for"
+    assert len(page) - len(data) < 100_000, "under a tenth of a megabyte beside the data"
     for word in ("http:", "https:", "import(", "@import", "url(", "fetch(", "XMLHttpRequest", "eval("):
-        assert word not in found.scripts[1].replace("http://www.w3.org/2000/svg", ""), word
+        assert word not in code.replace("http://www.w3.org/2000/svg", ""), word
     assert "default-src 'none'" in page
 
 
@@ -241,19 +228,13 @@ def test_the_page_holds_what_was_computed(scene):
 
 
 def test_names_are_text_and_never_markup(scene):
-    named = replace(scene, name=HOSTILE, facts={HOSTILE: HOSTILE})
-    named.shots[0].facts[HOSTILE] = HOSTILE
-    try:
-        page = pages.build_viewer_page(named)
-    finally:
-        del named.shots[0].facts[HOSTILE]
-    found = Tags(page)
-    assert len(found.scripts) == 2, "no script of theirs"
-    data = json.loads(found.scripts[0])
-    assert data["title"] == HOSTILE and data["facts"] == {HOSTILE: HOSTILE} == {
-        k: v for k, v in data["shots"][0]["facts"].items() if k == HOSTILE
-    }
-    assert not set(found.scripts[0]) & set("<>&")
+    shot = replace(scene.shots[0], facts={**scene.shots[0].facts, HOSTILE: HOSTILE})
+    named = replace(scene, name=HOSTILE, facts={HOSTILE: HOSTILE}, shots=[shot, *scene.shots[1:]])
+    data, _ = SCRIPT.findall(pages.build_viewer_page(named))  # no script of theirs
+    assert not set(data) & set("<>&")
+    data = json.loads(data)
+    assert data["title"] == HOSTILE and data["facts"] == {HOSTILE: HOSTILE}
+    assert data["shots"][0]["facts"][HOSTILE] == HOSTILE
 
 
 # --------------------------------------------------------------------------------------------------------- the browser
@@ -345,47 +326,12 @@ def recorded(scene, tmp_path_factory):
     return chunks.RrdReader(rrd.write_rrd(tmp_path_factory.mktemp("rrd") / "view.rrd", scene))
 
 
-def column(reader, entity, component):
-    """Values of a component of an entity, chunk by chunk, in the order of the pairs."""
-    found = []
-    for chunk in reader.stream():
-        if chunk.entity_path != entity:
-            continue
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.split(":")[-1] == component:
-                order = batch.column("pair").to_pylist() if "pair" in batch.schema.names else [0] * batch.num_rows
-                found += list(zip(order, batch.column(name).to_pylist(), strict=True))
-    return [value for _, value in sorted(found, key=lambda item: item[0])]
-
-
 def test_a_recording_holds_everything(recorded):
-    paths = set(recorded.store().schema().entity_paths())
-    assert {f"/gates/{name.lower()}" for name in ("SENSOR", *names(Gate).values())} <= paths
-    for name in (
-        "path",
-        "reference/picture",
-        "reference/depth",
-        "reference/picture/samples/unanswered",
-        "source/picture/tracks",
-    ):
-        assert f"/world/{name}" in paths, name
-    assert {"/pair", "/about", "/world/map/sensor", "/world/map/held_out", "/world/map/sigma"} <= paths
-    assert "/world/map/swept" in paths
-
-
-def test_a_recording_is_read_back_as_computed(recorded, scene):
-    where = column(recorded, "/world/map/recovered", "positions")
-    radii = column(recorded, "/world/map/recovered", "radii")
-    counts = column(recorded, "/gates/answer", "scalars")
-    swept = column(recorded, "/world/map/swept", "positions")
-    for k, shot in enumerate(scene.shots):
-        s, T = shot.samples, shot.T_world_from_0
-        here = s["source"] == Source.RECOVERED
-        assert np.allclose(where[k], s["xyz"][here] @ T[:3, :3].T + T[:3, 3], atol=1e-5)
-        assert np.allclose(radii[k], s["sigma"][here].clip(rrd._MIN_RADIUS_M, rrd._MAX_RADIUS_M), atol=1e-6)
-        assert counts[k] == [shot.gates()["ANSWER"]]
-        assert np.allclose(swept[k], shot.swept.xyz @ T[:3, :3].T + T[:3, 3], atol=1e-5)
+    expected = {f"/gates/{name.lower()}" for name in ("SENSOR", *names(Gate).values())} | {"/pair", "/about"}
+    reference = ("", "/picture", "/depth", "/picture/samples/unanswered")
+    expected |= {"/world/path", "/world/source/picture/tracks", *(f"/world/reference{each}" for each in reference)}
+    expected |= {f"/world/map/{name}" for name in ("sensor", "held_out", "sigma", "swept")}
+    assert expected <= set(recorded.store().schema().entity_paths())
 
 
 # --------------------------------------------------------------------------------------------------------- the command
@@ -448,17 +394,19 @@ def test_bad_input_gets_one_clear_line(command, args, words):
 def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
     result = result_files.read_result(job)
     result["config"]["data"] = {"_target_": "dhtorch.data.open_all", "root": "gone", "format": "auto"}
-    result_files.write_result(tmp_path / "old" / "result.json", result)
-    code, _, err = command("view", "old", "html=page.html")
-    assert code == 2 and "gone" in err
-    shutil.copytree(job / "synthetic_room", tmp_path / "old" / "synthetic_room")
-    code, out, err = command("view", "old", "html=page.html")
-    assert code == 0 and "points.ply" in err and "page.html" in out
+    none = result | {"data": result["data"] | {"scenes": []}}
+    for with_points, given, ends, said in (
+        (False, result, 2, "gone"),
+        (True, result, 0, "points.ply"),
+        (True, none, 2, "dhtorch: scene: found None, expected a number below 0"),
+    ):
+        result_files.write_result(tmp_path / "old" / "result.json", given)
+        if with_points:
+            shutil.copytree(job / "synthetic_room", tmp_path / "old" / "synthetic_room", dirs_exist_ok=True)
+        code, out, err = command("view", "old", "html=page.html")
+        assert code == ends and said in err and (code or "page.html" in out)
     data = data_of((tmp_path / "page.html").read_text())
     assert data["title"] == "synthetic_room" and not data["views"]
-    result_files.write_result(tmp_path / "old" / "result.json", result | {"data": result["data"] | {"scenes": []}})
-    code, _, err = command("view", "old", "html=page.html")
-    assert code == 2 and err.startswith("dhtorch: scene: found None, expected a number below 0")
 
 
 # ------------------------------------------------------------------------------------------- files from anywhere
@@ -500,20 +448,6 @@ def test_a_result_calls_only_what_settings_are_meant_to_name(job, name):
 
 #: Of the settings that ship, those that write: they are not shown again.
 WRITING = {"dhtorch.synthetic.robot.open_robot"}
-
-
-def test_a_result_that_writes_is_refused(job, command, tmp_path):
-    result = result_files.read_result(job)
-    options = {"tasks": 1, "scenes": 1, "n_frames": 1, "hw": [36, 64]}
-    result["config"]["data"] = {
-        "_target_": "dhtorch.synthetic.robot.open_robot",
-        "root": str(tmp_path / "new"),
-        **options,
-    }
-    result_files.write_result(tmp_path / "old" / "result.json", result)
-    code, _, err = command("view", "old", "html=page.html")
-    assert code == 2 and len(err.splitlines()) == 1 and "config.data._target_: found 'dhtorch.synthetic.robot" in err
-    assert not (tmp_path / "new").exists() and not (tmp_path / "page.html").exists()
 
 
 def test_what_a_result_may_name_writes_nothing(job, tmp_path, monkeypatch):
@@ -612,3 +546,146 @@ def test_broken_points_are_refused(tmp_path, content):
     (tmp_path / "p.ply").write_bytes(content)
     with pytest.raises(ValueError, match=r"p\.ply"):
         points.read_ply_exhibit(tmp_path / "p.ply")
+
+
+def view(k):
+    return ExhibitView(
+        number=10 + k, hw=(60, 80), f=(50.0 + k, 60.0 + k), c=(40.0 + k, 30.0 + k), jpeg=b"\xff\xd8" + bytes([k]),
+        jpeg_hw=(30, 20), time=1.5 + k,
+    )  # fmt: skip
+
+
+def pose(k):
+    T = np.eye(4)
+    c, s = np.cos(0.1 * k), np.sin(0.1 * k)
+    T[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    T[:3, 3] = k, 2 * k, 3 * k
+    return T
+
+
+def cloud(first, n=2):
+    xyz = np.arange(first, first + 3 * n, dtype=np.float32).reshape(n, 3)
+    return PointCloud(xyz, np.full((n, 3), first, np.uint8))
+
+
+@pytest.fixture
+def exhibit():
+    n = 4
+    whole = np.arange(n)
+    samples = {
+        "uv_0": np.stack([10.0 + whole, 20.0 + whole], 1).astype(np.float32),
+        "uv_1": np.stack([15.0 + whole, 26.0 + whole], 1).astype(np.float32),
+        "xyz": np.arange(3 * n, dtype=np.float32).reshape(n, 3),
+        "rgb": np.arange(3 * n, dtype=np.uint8).reshape(n, 3),
+        "depth": np.array([1.0, 2.0, 4.0, 8.0], np.float32),
+        "sigma": np.array([0.01, 0.02, 0.4, 0.8], np.float32),
+        "score": np.array([0.0, 0.25, 0.5, 1.0], np.float32),
+        "parallax_deg": np.array([1.0, 2.0, 3.0, 4.0], np.float32),
+        "residual_px": np.array([0.1, 0.2, 0.3, 0.4], np.float32),
+        "error": np.array([0.01, 0.02, 0.03, np.nan], np.float32),
+        "source": np.array([Source.SENSOR, Source.NONE, Source.RECOVERED, Source.RECOVERED], np.int32),
+        "gate": np.array([Gate.NO_TRACK, Gate.PARALLAX, Gate.ANSWER, Gate.ANSWER], np.int32),
+        "hole": np.array([Hole.NONE, Hole.TOO_DARK, Hole.TRACKABLE_NO_LIDAR, Hole.TRACKABLE_NO_LIDAR], np.int32),
+        "tracked": np.array([False, True, True, True]),
+        "candidate": np.array([False, False, True, False]),
+    }  # fmt: skip
+    swept = SweptPointCloud(
+        *(getattr(cloud(60), name) for name in ("xyz", "rgb")),
+        np.float32([0.3, 0.6]),
+        np.float32([0.2, 0.9]),
+        np.uint8([Source.SWEPT, Source.FILLED]),
+    )
+    shot = PairExhibit(
+        "10 11", samples, pose(1), pose(2), view_0=0, view_1=1, seen=cloud(20), held_out=cloud(40), swept=swept,
+        depth_image=DepthImage(np.ones((3, 5), np.float32), (7.0, 8.0), (2.0, 1.0)),
+    )  # fmt: skip
+    return Exhibit("two cameras", [shot], [view(0), view(1)])
+
+
+def test_a_page_places_each_camera_where_it_stood(exhibit):
+    page = pages.build_viewer_page(exhibit)
+    data = json.loads(re.search(r"<script[^>]*json[^>]*>(.*?)</script>", page, re.DOTALL).group(1))
+    (shot,) = data["shots"]
+    for k in (1, 2):
+        assert np.allclose(np.reshape(shot[f"T_world_from_{k - 1}"], (3, 4)), pose(k)[:3])
+    assert (shot["view_0"], shot["view_1"]) == (0, 1)
+    for k, sent in enumerate(data["views"]):
+        assert (sent["number"], sent["time"], sent["hw"]) == (10 + k, 1.5 + k, [60, 80])
+        assert (sent["f"], sent["c"]) == ([50.0 + k, 60.0 + k], [40.0 + k, 30.0 + k])
+        assert base64.b64decode(sent["jpeg"])[2] == k
+    for name in ("uv_0", "uv_1"):
+        uv = unpacked(shot["samples"][name]).reshape(-1, 2) / data["per_pixel"] - data["margin_px"]
+        assert np.allclose(uv, exhibit.shots[0].samples[name])
+    for name in ("seen", "held_out", "swept"):
+        xyz = unpacked(shot[name]["xyz"]).reshape(-1, 3) * shot[name]["step"] + shot[name]["low"]
+        assert np.allclose(xyz, getattr(exhibit.shots[0], name).xyz, atol=1e-3)
+    assert np.allclose(unpacked(shot["samples"]["score"]) / 65535, [0, 0.25, 0.5, 1], atol=1e-4)
+    assert np.allclose(unpacked(shot["swept"]["score"]) / 65535, [0.2, 0.9], atol=1e-4)
+    assert unpacked(shot["swept"]["source"]).tolist() == [Source.SWEPT, Source.FILLED]
+    assert data["about"].endswith(", 1 swept and 1 filled pixels")
+
+
+class Log:
+    """A recording stream, and a rerun module whose archetypes are their arguments."""
+
+    def __init__(self):
+        self.entries = {}
+
+    def log(self, name, *parts):
+        self.entries.setdefault(name, []).extend(parts)
+
+    def set_time(self, *args, **options):
+        pass
+
+    def __getattr__(self, kind):
+        return lambda *args, **options: SimpleNamespace(kind=kind, args=args, **options)
+
+    def of(self, name, kind):
+        (entry,) = [part for part in self.entries[name] if part.kind == kind]
+        return entry
+
+
+def test_a_recording_places_each_camera_and_every_point_where_it_stood(exhibit):
+    log, (shot,) = Log(), exhibit.shots
+    rrd._log_points(log, log, shot, True)
+    rrd._log_views(log, log, shot, *exhibit.views)
+    for k, name in ((1, "reference"), (2, "source")):
+        placed, camera = log.of(f"world/{name}", "Transform3D"), log.of(f"world/{name}/picture", "Pinhole")
+        assert np.allclose(placed.translation, pose(k)[:3, 3]) and np.allclose(placed.mat3x3, pose(k)[:3, :3])
+        own = exhibit.views[k - 1]
+        assert np.allclose(camera.focal_length, np.array(own.f) * [20 / 80, 30 / 60])
+        assert np.allclose(camera.principal_point, (np.array(own.c) + 0.5) * [20 / 80, 30 / 60])
+        assert (camera.width, camera.height) == (20, 30)
+        assert log.of(f"world/{name}/picture", "EncodedImage").contents == own.jpeg
+    depth = log.of("world/reference/depth", "Pinhole")
+    assert (
+        depth.principal_point == [2.5, 1.5]
+        and depth.focal_length == (7.0, 8.0)
+        and (depth.width, depth.height) == (5, 3)
+    )
+    placed = lambda xyz: xyz @ pose(1)[:3, :3].T + pose(1)[:3, 3]  # noqa: E731
+    points = log.of("world/map/recovered", "Points3D")
+    assert np.allclose(points.args[0], placed(shot.samples["xyz"][2:])) and len(points.radii) == 2
+    for name in ("held_out", "swept"):
+        assert np.allclose(log.of(f"world/map/{name}", "Points3D").args[0], placed(getattr(shot, name).xyz))
+    assert log.of("world/map/swept", "Points3D").class_ids.tolist() == [rrd._SWEPT_CLASS, rrd._FILLED_CLASS]
+    assert np.allclose(log.of("world/map/sensor", "Points3D").args[0], placed(shot.seen.xyz))
+    alone = Log()
+    rrd._log_points(alone, alone, replace(shot, seen=EMPTY_CLOUD), False)
+    sensed = alone.of("world/map/sensor", "Points3D")
+    assert (
+        np.allclose(sensed.args[0], placed(shot.samples["xyz"][:1]))
+        and (sensed.colors == shot.samples["rgb"][:1]).all()
+    )
+    bars = log.of("world/map/sigma", "LineStrips3D").args[0]
+    assert np.allclose(bars[:, 0], placed(0.9 * shot.samples["xyz"][2:]))
+    assert np.allclose(bars[:, 1], placed(1.1 * shot.samples["xyz"][2:]))
+    tracks = log.of("world/source/picture/tracks", "LineStrips2D").args[0]
+    to_jpeg = lambda uv: (uv + 0.5) * [20 / 80, 30 / 60]  # noqa: E731
+    tracked = shot.samples["tracked"]
+    assert np.allclose(tracks[:, 0], to_jpeg(shot.samples["uv_0"][tracked]))
+    assert np.allclose(tracks[:, 1], to_jpeg(shot.samples["uv_1"][tracked]))
+    silent = log.of("world/reference/picture/samples/unanswered", "Points2D")
+    assert np.allclose(silent.args[0], to_jpeg(shot.samples["uv_0"][1:2])) and silent.class_ids.tolist() == [
+        Gate.PARALLAX
+    ]

@@ -9,8 +9,7 @@ sweep; ``text`` and ``page`` write the output.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
 from dhtorch.experiments.report.reading import Result, describe_result, metric_value, scene_rows
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, generic_tables
 from dhtorch.runtime import results as result_files
-from dhtorch.runtime.console import HELP_EPILOG, format_count, get_verbosity, progress
+from dhtorch.runtime.console import Progress, format_count, get_verbosity
 from dhtorch.runtime.output_folder import open_output_folder
 
 __all__ = [
@@ -114,37 +113,31 @@ def to_markdown(result: Result) -> str:
     return text.tables_to_markdown(tables(result))
 
 
-def main(argv: Sequence[str]) -> int:
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
     """Run ``dhtorch report RESULT…``: print tables of archived results, or write a page; returns the exit code.
 
     Raises:
         FileNotFoundError, ValueError: a result is missing or invalid, or the page cannot be written.
     """
-    parser = argparse.ArgumentParser(
-        prog="dhtorch report", description="Tables and a page from archived results.", epilog=HELP_EPILOG
-    )
-    parser.add_argument("result", nargs="+", type=Path, help="result.json, or a folder with one or many below it")
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--markdown", action="store_true", help="Markdown instead of console tables")
-    form.add_argument("--html", type=Path, metavar="FILE", help="write one page with tables and figures instead")
-    parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
-    options = parser.parse_args(argv)
-    paths = list(_find_results(options.result))
+    folders, is_markdown = [Path(str(each)).expanduser() for each in settings["result"]], settings["markdown"]
+    if settings["html"] and is_markdown:
+        raise ValueError("markdown: found true with html, expected one of them")
+    paths = list(_find_results(folders))
     results = [result_files.read_result(path) for path in progress(paths, "results", len(paths))]
-    if options.html:
-        print(f"wrote {page.write_report(options.html, results)}: {format_count(len(results), 'result')}")
+    if settings["html"]:
+        print(f"wrote {page.write_report(Path(settings['html']), results)}: {format_count(len(results), 'result')}")
         return 0
-    for folder in options.result:
+    for folder in folders:
         jobs_of_folder = [
             r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)
         ]
-        print_sweep(jobs_of_folder, folder, markdown=options.markdown)
+        print_sweep(jobs_of_folder, folder, markdown=is_markdown)
     experiments = {r["experiment"] for r in results}
-    if len(options.result) == 1 and len(results) > 1 and len(experiments) == 1 and get_verbosity() != "verbose":
+    if len(folders) == 1 and len(results) > 1 and len(experiments) == 1 and get_verbosity() != "verbose":
         return 0  # the table of the sweep is enough; -v shows every job
     for path, result in zip(paths, results, strict=True):
         try:
-            if options.markdown:
+            if is_markdown:
                 print(to_markdown(result))
                 continue
             print(path)

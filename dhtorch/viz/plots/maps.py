@@ -50,7 +50,7 @@ class Scale(NamedTuple):
 SIGMA_SCALE = Scale("sigma / depth, %", colours.ERROR_CMAP, 0.005, 0.2, percent=True)
 
 
-def fit_depth_scale(depth: np.ndarray) -> Scale:
+def _fit_depth_scale(depth: np.ndarray) -> Scale:
     """Depths -> log scale: the nearest and farthest 1 % have the colours of its ends, near blue, far red."""
     low, high = np.quantile(depth, (0.01, 0.99)).tolist() if depth.size else (0.5, 5.0)
     return Scale("depth, m", colours.DEPTH_CMAP, low, max(high, 1.25 * low))
@@ -110,7 +110,7 @@ def draw_completed(
     """
     z, code = as_array(depth), as_array(source)
     answered = np.isfinite(z) & (z > 0) & (code != Source.NONE)
-    sensed, scale = answered & (code == Source.SENSOR), fit_depth_scale(z[answered])
+    sensed, scale = answered & (code == Source.SENSOR), _fit_depth_scale(z[answered])
     maps = [
         (f"Sensor: {100 * sensed.mean():.0f} % of the pixels", scale.paint(z, sensed)),
         (f"Completed: {_format_kinds(code, answered)}", scale.paint(z, answered)),
@@ -131,9 +131,9 @@ def draw_aligned(
     """Draw image, input map, aligned map, and its sigma / depth; both maps on log scales over their own ranges."""
     x, z = (as_array(q).reshape(as_array(q).shape[-2:]) for q in (input_map, depth))
     known, answered = (np.isfinite(q) & (q > 0) for q in (x, z))
-    scale = fit_depth_scale(z[answered])
+    scale = _fit_depth_scale(z[answered])
     maps = [
-        (f"Input map: {100 * known.mean():.0f} %, own range", fit_depth_scale(x[known]).paint(x, known)),
+        (f"Input map: {100 * known.mean():.0f} %, own range", _fit_depth_scale(x[known]).paint(x, known)),
         (f"Aligned: {100 * answered.mean():.0f} %, the rest no answer", scale.paint(z, answered)),
         (_COLUMNS[3], _paint_sigma(z, sigma, answered)),
     ]
@@ -159,7 +159,7 @@ def draw_validation(
     checked, n = wrong + consistent, int(there.sum())
     fraction = f", of which {100 * wrong / checked:.1f} % are wrong" if checked else ""
     scale, evidence_scale = (
-        fit_depth_scale(z[there]),
+        _fit_depth_scale(z[there]),
         Scale("evidence, sigmas", colours.SIGNED_CMAP, -6.0, 6.0, log=False),
     )
     maps = [
@@ -197,7 +197,7 @@ class CompletedView(NamedTuple):
 
 def fit_common_depth_axis(views: Sequence[CompletedView]) -> Scale:
     """Views -> log scale of all their depths."""
-    return fit_depth_scale(np.concatenate([as_array(view.depth)[view.masks[1]] for view in views]))
+    return _fit_depth_scale(np.concatenate([as_array(view.depth)[view.masks[1]] for view in views]))
 
 
 def draw_contact_sheet(path: str | Path | IO[bytes], views: Sequence[CompletedView], *, title: str = "") -> None:
