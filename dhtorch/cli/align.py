@@ -292,9 +292,16 @@ def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exc
             draw_aligned(out, task.recording[i].image[0], maps[i], **aligned, title=title)
             image = out.getvalue()
         frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, image))
-    failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
-    place, table = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
-    return pages.write_validation_page(place, task.scene.name, sentences=lines, word="align", note=_PAGE_NOTE, **table)
+    return pages.write_validation_page(
+        task.folder / "align.html",
+        task.scene.name,
+        sentences=lines,
+        columns=_TABLE_COLUMNS,
+        frames=frames,
+        failed=[f"Exceeded: {limit_line}" for limit_line in exceeded],
+        word="align",
+        note=_PAGE_NOTE,
+    )
 
 
 def _severity(row: Row) -> float:

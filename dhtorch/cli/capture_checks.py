@@ -9,7 +9,8 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from dhtorch.data.foreign_files import NEEDS_DEPTH, describe_layout
@@ -89,7 +90,7 @@ def check_data(data: Any) -> Any:
         examined = check_scene(first).recording
         added = tuple(line for line in examined.report if line not in first.recording.report)
         is_refuted = first.recording.poses is not None and examined.poses is None
-        return replace(scenes, annotate=_AsFirst(scenes.annotate, added, is_refuted))
+        return replace(scenes, annotate=partial(_annotate_as_first, scenes.annotate, added, is_refuted))
     if isinstance(data, Scene | Recording):
         return check_scene(Scene.of(data))
     if isinstance(data, Sequence) and all(isinstance(each, Scene | Recording) for each in data):
@@ -117,16 +118,10 @@ def print_check(name: str, check: CaptureCheck) -> None:
         warnings.warn(f"{name}: {finding}", stacklevel=2)
 
 
-@dataclass(frozen=True)
-class _AsFirst:
-    """Recording → scene with what the check of the set's first recording showed."""
-
-    annotate: Callable[[Recording], Scene]
-    added: tuple[str, ...]  # lines of its report
-    is_refuted: bool  # whether its poses are
-
-    def __call__(self, recording: Recording) -> Scene:
-        scene = self.annotate(recording)
-        poses = None if self.is_refuted else scene.recording.poses
-        report = (*scene.recording.report, *self.added)
-        return replace(scene, recording=replace(scene.recording, poses=poses, report=report))
+def _annotate_as_first(
+    annotate: Callable[[Recording], Scene], added: Sequence[str], is_refuted: bool, recording: Recording
+) -> Scene:
+    """Recording → scene with the lines, and without the poses, that the check of the set's first recording gave."""
+    scene = annotate(recording)
+    poses, report = None if is_refuted else scene.recording.poses, (*scene.recording.report, *added)
+    return replace(scene, recording=replace(scene.recording, poses=poses, report=report))

@@ -134,11 +134,6 @@ class Layout:
         """Largest depth that fits the 16 bits, m."""
         return self.unit * MAX_DEPTH_CODE
 
-    @property
-    def side_files(self) -> tuple[str, ...]:
-        """Names of the files that :meth:`close` may write."""
-        return _SIDE_FILES.get(self.name, ())
-
     def stem(self, recording: Recording, i: int) -> str:
         """Stem of the file names of a frame."""
         if self.stamped and recording.times is not None:
@@ -359,7 +354,7 @@ def open_task_folder(task: CompletionTask, more: Iterable[str] = ()) -> Iterator
         if folder.is_unlisted and shared_file.is_file():  # of an older version, without a manifest, with this key
             folder.adopt([*task.folder.iterdir(), *(path for name in task.done for path in files.get(name, ()))])
         folder.check_folders(task.folder / kind for kind in (*task.layout.folders, *extras))
-        folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
+        folder.check(task.folder / name for name in ("complete.json", *_SIDE_FILES.get(task.layout.name, ()), *more))
         for i in task.frames:
             if task.name(i) not in task.done:
                 folder.check(task.map_files(i))

@@ -336,8 +336,9 @@ def _process_recording(
         placed = _place_frames(recovered)
         lines = describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
         lines += describe_placing(check, recording, placed)
+        assumed = [f"{check.assumed_unit[:1].upper()}{check.assumed_unit[1:]}."] if check.assumed_unit else []
         opening = build_opening(
-            [*describe_check(check), *lines],
+            [*assumed, *(f"Warning: {finding}." for finding in check.findings), *lines],
             stats,
             *write_overview(task, recovered.frames),
         )
@@ -548,12 +549,6 @@ def describe_recovery(
     amount += f" {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth"
     amount += f"; filled {filled} by interpolation" if filled else ""
     return [sensor, f"{amount} ({format_count(stats.frames, 'frame')})."]
-
-
-def describe_check(check: CaptureCheck) -> list[str]:
-    """Sentences of the page on what was assumed and on the findings."""
-    assumed = [f"{check.assumed_unit[:1].upper()}{check.assumed_unit[1:]}."] if check.assumed_unit else []
-    return [*assumed, *(f"Warning: {finding}." for finding in check.findings)]
 
 
 def describe_placing(check: CaptureCheck, recording: Recording, placed: Recording) -> list[str]:

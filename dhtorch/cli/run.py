@@ -369,11 +369,14 @@ def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
         The settings composed from the choices alone, and the arguments for Hydra: while the format is unknown, options
         of any reader are added to the settings.
     """
+    import hydra  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
     folder = config_dir()
     groups = [p.name for p in folder.iterdir() if p.is_dir()]
     chosen = words.list_choices(argv, folder)
     first = [f"{group}={names[0]}" for group, names in chosen.items()]
-    composed = _compose_choices(folder, name, tuple(first))
+    composed: Any = OmegaConf.to_container(hydra.compose(name, first))
     swept_names = [
         f"{group}.{option}"
         for group, names in chosen.items()
@@ -385,15 +388,6 @@ def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
         argv, composed, groups, [*swept_names, *words.list_reader_options(composed, readers)], _IMPLIED_CHOICES
     )
     return composed, words.add_reader_options(argv, composed, readers)
-
-
-@functools.cache
-def _compose_choices(folder: Path, name: str, choices: tuple[str, ...]) -> Any:
-    """The settings ``name`` of a folder with the choices of some groups; not to be changed."""
-    import hydra  # noqa: PLC0415
-    from omegaconf import OmegaConf  # noqa: PLC0415
-
-    return OmegaConf.to_container(hydra.compose(name, list(choices)))
 
 
 @functools.cache

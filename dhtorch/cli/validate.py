@@ -411,7 +411,6 @@ def _write_page(place: Path, validated: _RecordingValidation, whole: Row, exceed
         cells += [pages.format_estimate(row[name]) for name in ("scale", "shift", "tilt")]
         cells.append("–" if row["clip_depth"] is None else f"{row['clip_depth']:.3g}")
         frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, validated.pictures.get(row["frame"])))
-    failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
     notes = [f"{line[:1].upper()}{line[1:]}." for line in validated.scene.recording.report]
     lines = _format_summary(validated.scene.name, whole, validated.notes) + notes
     return pages.write_validation_page(
@@ -420,5 +419,5 @@ def _write_page(place: Path, validated: _RecordingValidation, whole: Row, exceed
         sentences=lines,
         columns=_TABLE_COLUMNS,
         frames=frames,
-        failed=failed,
+        failed=[f"Exceeded: {limit_line}" for limit_line in exceeded],
     )

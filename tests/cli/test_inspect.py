@@ -155,19 +155,24 @@ def test_facts_of_a_recording(tmp_path: Path) -> None:
     writers.write_named_frames(tmp_path, frames, fps=30)
     survey = only(tmp_path)
     said = facts(survey)
-    assert said["unit"] == "depth unit assumed: 1/1000 m (data.depth_unit= sets it)"
-    assert said["frames"] == "4" and said["rate"] == "30 Hz measured, nominal 30 Hz" and said["duration"] == "0.100 s"
-    assert said["pictures"] == "64x48, colour, 8 bits" and said["depth"] == "64x48"
-    assert said["holes"] == "0.0 to 50.0 % of the depth map"
-    assert said["intrinsics"].startswith("f 61.50 60.25, c 33.50 21.75 px, field of view 55° x 43°, no distortion")
+    steps = torch.cat([f.T_world_from_cam.t for f in frames]).diff(dim=0).norm(dim=-1)
+    for name, text in {
+        "unit": "depth unit assumed: 1/1000 m (data.depth_unit= sets it)",
+        "frames": "4",
+        "rate": "30 Hz measured, nominal 30 Hz",
+        "duration": "0.100 s",
+        "pictures": "64x48, colour, 8 bits",
+        "depth": "64x48",
+        "holes": "0.0 to 50.0 % of the depth map",
+        "intrinsics": "f 61.50 60.25, c 33.50 21.75 px, field of view 55° x 43°, no distortion",
+        "path": f"{float(steps.sum()):.3f} m long",
+        "speed": f"at most {30 * float(steps.max()):.3f} m/s",
+    }.items():
+        assert text in said[name], name
     values = torch.cat([f.depth[f.depth > 0] for f in frames])
     median = float(said["depth percentiles"].split("50 %: ")[1].split(",")[0])
     assert median == pytest.approx(float(values.quantile(0.5)), abs=2e-3)
-    steps = torch.cat([f.T_world_from_cam.t for f in frames]).diff(dim=0).norm(dim=-1)
-    assert said["path"].startswith(f"{float(steps.sum()):.3f} m long")
-    assert said["speed"].endswith(f"at most {30 * float(steps.max()):.3f} m/s")
-    assert float(said["depth and poses"].split()[2]) < 3
-    assert survey.warnings == []
+    assert float(said["depth and poses"].split()[2]) < 3 and survey.warnings == []
     assert [tile.title for tile in survey.tiles] == ["0", "1", "2", "3"]
 
 

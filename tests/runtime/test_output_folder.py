@@ -8,7 +8,9 @@ import signal
 import socket
 import stat
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -173,16 +175,17 @@ def test_what_is_in_the_place_of_dhtorchs_own_records_is_refused(tmp_path, name,
 
 
 def test_a_folder_without_results_leaves_nothing(tmp_path):
-    for path in (tmp_path / "a" / "b", tmp_path / "there"):
-        (tmp_path / "there").mkdir(exist_ok=True)
+    there, user = tmp_path / "there", tmp_path / "out" / "user.dhtorch"
+    there.mkdir()
+    for path in (tmp_path / "a" / "b", there):
         with open_output_folder(path, "out"):
             assert (path / PRIVATE_FOLDER / "lock").is_file()
-    assert not (tmp_path / "a" / "b").exists() and not list((tmp_path / "there").iterdir())
+    assert not (tmp_path / "a" / "b").exists() and not list(there.iterdir())
     write(tmp_path / "out", a=b"1")
     (tmp_path / "out" / "a").unlink()
     assert not storage.has_files(tmp_path / "out"), "private files are no results"
-    (tmp_path / "out" / "user.dhtorch").mkdir()
-    (tmp_path / "out" / "user.dhtorch" / "a").write_text("mine")
+    user.mkdir()
+    (user / "a").write_text("mine")
     assert storage.has_files(tmp_path / "out")
 
 
@@ -269,28 +272,21 @@ def test_a_name_that_is_too_long_is_refused_before_anything_is_written(tmp_path,
 # -------------------------------------------------------------------------------------------------------- two writers
 
 
-def _race(folder, begin, end, number):
-    begin.wait()
+def _race(folder, number):
+    """Message of a refused writer, empty for one that has written."""
     try:
         write(folder, a=b"%d" % number, depth__b=b"%d" % number)
+        return ""
     except BlockingIOError as error:
-        end.put((number, str(error)))
-    else:
-        end.put((number, ""))
+        return str(error)
 
 
 def test_of_fifty_that_race_each_is_refused_in_a_line_or_right(tmp_path):
-    out, begin, end = tmp_path / "out", FORK.Event(), FORK.SimpleQueue()
-    processes = [FORK.Process(target=_race, args=(out, begin, end, k)) for k in range(50)]
-    for process in processes:
-        process.start()
-    begin.set()
-    ends = dict(end.get() for _ in processes)
-    for process in processes:
-        process.join()
-        assert process.exitcode == 0
-    winners = {b"%d" % number for number, refusal in ends.items() if not refusal}
-    assert all("another dhtorch process" in line and "\n" not in line for line in ends.values() if line)
+    out = tmp_path / "out"
+    with ProcessPoolExecutor(50, mp_context=FORK) as pool:
+        ends = list(pool.map(partial(_race, out), range(50)))
+    winners = [b"%d" % number for number, refusal in enumerate(ends) if not refusal]
+    assert all("another dhtorch process" in line and "\n" not in line for line in ends if line)
     files = contents(out)
     assert set(files) == {"a", "depth/b"} and files["a"] == files["depth/b"] and files["a"] in winners
     assert private(out) == ["manifest"]
