@@ -52,37 +52,46 @@ _VECTOR_FLAGS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "A
 
 _PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
 
-#: Field → type, for the result and for its parts.
-_OPTIONAL_TEXT = (str, None)
-_OPTIONAL_NUMBER = (float, None)
-_RESULT_FIELDS: dict[str, Any] = {
-    **{
-        "schema": int,
-        "experiment": str,
-        "question": _OPTIONAL_TEXT,
-        "expectation": _OPTIONAL_TEXT,
-        "verdict": _OPTIONAL_TEXT,
-        "why": _OPTIONAL_TEXT,
+#: Fields of a result and their types: several in a tuple, None = null; a list holds items of one kind; fields with
+#: ``?`` were added later, or are no longer written; ``*`` stands for all other fields.
+_TEXT_OR_NULL, _NUMBER_OR_NULL = (str, None), (float, None)
+_SCHEMA: dict[str, Any] = {
+    "schema": int,
+    "experiment": str,
+    "question": _TEXT_OR_NULL,
+    "expectation": _TEXT_OR_NULL,
+    "verdict": _TEXT_OR_NULL,
+    "why": _TEXT_OR_NULL,
+    "key": str,
+    "meta": {
+        "utc": str,
+        "git": _TEXT_OR_NULL,
+        "versions": dict,
+        "device": str,
+        "dtype": str,
+        "threads": int,
+        "seed": int,
+        "processor?": str,
+        "operators?": str,
+        "code?": str,
     },
-    **{"key": str, "meta": dict, "config": dict, "data": dict, "summary": dict, "rows": list},
+    "config": dict,
+    "data": {"name": str, "scenes": list, "n_pairs": int, "digest": str},
+    "summary": {
+        "*": {"value": _NUMBER_OR_NULL, "low": _NUMBER_OR_NULL, "high": _NUMBER_OR_NULL, "n": int, "unit": str}
+    },
+    "rows": [
+        {
+            "scene": str,
+            "pair": (list, None),
+            "method": str,
+            **dict.fromkeys(("truth?", "role?", "note?"), _TEXT_OR_NULL),
+            "*": Any,
+        }
+    ],
+    "seal?": str,
+    "metrics?": [{"name": str, "larger_is_better": (bool, None), "with_interval": bool}],
 }
-_META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": dict}
-_META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
-#: Fields added later, or no longer written: optional when reading.
-_ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str, "metrics": list}
-_ADDED_META_FIELDS: dict[str, Any] = {"processor": str, "operators": str, "code": str}
-_DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
-_SUMMARY_FIELDS: dict[str, Any] = {
-    "value": _OPTIONAL_NUMBER,
-    "low": _OPTIONAL_NUMBER,
-    "high": _OPTIONAL_NUMBER,
-    "n": int,
-    "unit": str,
-}
-_METRIC_FIELDS: dict[str, Any] = {"name": str, "larger_is_better": (bool, None), "with_interval": bool}
-_ROW_FIELDS: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
-#: Fields of a row that only some experiments write.
-_OPTIONAL_ROW_FIELDS: dict[str, Any] = dict.fromkeys(("truth", "role", "note"), _OPTIONAL_TEXT)
 
 
 def build_result(
@@ -131,25 +140,17 @@ def validate_result(result: Any, where: str = "result") -> None:
     Raises:
         ValueError: names the first field that is missing, unknown, of the wrong type or out of range.
     """
-    _check_fields(result, _RESULT_FIELDS, where, _ADDED_RESULT_FIELDS)
+    _check_kind(result, _SCHEMA, where)
     _expect(result["schema"] == _RESULT_SCHEMA, f"{where}.schema", result["schema"], str(_RESULT_SCHEMA))
+    has_question = result["experiment"] not in _JOBS_WITHOUT_QUESTION
     for name in ("question", "expectation", "verdict", "why"):
-        if result["experiment"] in _JOBS_WITHOUT_QUESTION:
-            _expect(result[name] is None, f"{where}.{name}", result[name], "null for this experiment")
-        else:
-            _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
-    if result["experiment"] not in _JOBS_WITHOUT_QUESTION:
-        _expect(result["verdict"] in _VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(_VERDICTS))
+        expected = "a text" if has_question else "null for this experiment"
+        _expect(bool(result[name]) if has_question else result[name] is None, f"{where}.{name}", result[name], expected)
+    verdicts = _VERDICTS if has_question else (None,)
+    _expect(result["verdict"] in verdicts, f"{where}.verdict", result["verdict"], ", ".join(_VERDICTS))
     key = result["key"]
     _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
-    _check_fields(result["meta"], _META_FIELDS, f"{where}.meta", _ADDED_META_FIELDS)
-    _check_fields(result["data"], _DATA_FIELDS, f"{where}.data")
-    for name, entry in result["summary"].items():
-        _check_fields(entry, _SUMMARY_FIELDS, f"{where}.summary.{name}")
-    for k, metric in enumerate(result.get("metrics", ())):
-        _check_fields(metric, _METRIC_FIELDS, f"{where}.metrics.{k}")
     for k, row in enumerate(result["rows"]):
-        _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", _OPTIONAL_ROW_FIELDS, more=True)
         pair = row["pair"]
         is_pair = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
         _expect(is_pair, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
@@ -409,19 +410,26 @@ def make_portable(config: Mapping[str, Any], base: str | Path | None = None) -> 
     return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _LOCAL_OPTIONS}
 
 
-def _check_fields(
-    value: Any, kinds: Mapping[str, Any], where: str, optional: Mapping[str, Any] | None = None, more: bool = False
-) -> None:
-    _expect(isinstance(value, dict), where, value, "an object")
-    kinds = {**kinds, **{name: kind for name, kind in (optional or {}).items() if name in value}}
-    for name, kind in kinds.items():
-        if name not in value:
-            raise ValueError(f"{where}.{name}: found nothing, expected {_describe_kind(kind)}")
-        allowed = kind if isinstance(kind, tuple) else (kind,)
-        _expect(any(_is_of_kind(value[name], k) for k in allowed), f"{where}.{name}", value[name], _describe_kind(kind))
-    unknown = sorted(set(value) - set(kinds))
-    if unknown and not more:
-        raise ValueError(f"{where}.{unknown[0]}: found an unknown field, expected {', '.join(kinds)}")
+def _check_kind(value: Any, kind: Any, where: str) -> None:
+    """Check a value against a kind of :data:`_SCHEMA`."""
+    if isinstance(kind, dict):
+        _expect(isinstance(value, dict), where, value, "an object")
+        known = {name.rstrip("?"): name for name in kind if name != "*"}
+        for name, field in known.items():
+            if name in value:
+                _check_kind(value[name], kind[field], f"{where}.{name}")
+            elif name == field:
+                raise ValueError(f"{where}.{name}: found nothing, expected {_describe_kind(kind[field])}")
+        for name in sorted(value.keys() - known):
+            if "*" not in kind:
+                expected = ", ".join(name for name, field in known.items() if name == field or name in value)
+                raise ValueError(f"{where}.{name}: found an unknown field, expected {expected}")
+            _check_kind(value[name], kind["*"], f"{where}.{name}")
+    elif kind is not Any:
+        allowed = kind if isinstance(kind, tuple) else (type(kind) if isinstance(kind, list) else kind,)
+        _expect(any(_is_of_kind(value, k) for k in allowed), where, value, _describe_kind(kind))
+        for k, item in enumerate(value if isinstance(kind, list) else ()):
+            _check_kind(item, kind[0], f"{where}.{k}")
 
 
 def _is_of_kind(value: Any, kind: Any) -> bool:
@@ -442,7 +450,8 @@ def _describe_kind(kind: Any) -> str:
         list: "a list",
         None: "null",
     }
-    return " or ".join(kind_names[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
+    kinds = kind if isinstance(kind, tuple) else (type(kind) if isinstance(kind, dict | list) else kind,)
+    return " or ".join(kind_names[k] for k in kinds)
 
 
 def _expect(condition: bool, where: str, value: Any, expected: str) -> None:

@@ -19,7 +19,6 @@ from dhtorch.cli import run
 from dhtorch.codes import State
 from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io import decode
-from dhtorch.data.units import DepthUnit
 from dhtorch.experiments.compare import validate_study
 from dhtorch.experiments.protocol import Settings
 from dhtorch.export import encode_png
@@ -166,18 +165,9 @@ def test_maps_that_do_not_fit_or_are_hostile_are_refused(tmp_path, room, files, 
         open_depth_maps(tmp_path, room, unit)[0]
 
 
-def test_maps_have_the_stated_unit_and_are_laid_over_the_whole_image(tmp_path, room):
-    truth = room.truth(1)["depth"]
-    (tmp_path / "1.png").write_bytes(encode_png((truth[0].numpy() * 500).round().astype(np.uint16)))
-    assert torch.allclose(open_depth_maps(tmp_path, room, 0.002)[1], truth, atol=0.0011)
-    (tmp_path / "complete.json").write_text('{"unit_m": 0.002}')
-    assert open_depth_maps(tmp_path, room).unit == DepthUnit(0.002, "complete.json: unit_m")
+def test_maps_of_another_shape_are_laid_over_the_whole_image(tmp_path, room):
     with pytest.warns(UserWarning, match="maps of 64x64 are stretched"):
         assert open_depth_maps(folder_of(tmp_path / "square", ["0"], (64, 64)), room)[0].shape == (1, 64, 64)
-    (tmp_path / "npz").mkdir()
-    depth = room.truth(0)["depth"][0].numpy()
-    np.savez(tmp_path / "npz" / "0.npz", depth=depth, normal=np.zeros((3, *depth.shape)))
-    assert np.allclose(open_depth_maps(tmp_path / "npz", room)[0][0], depth), "of several arrays that called depth"
 
 
 # ---------------------------------------------------------------------------------------------- transform and study
@@ -232,30 +222,34 @@ def test_options_of_the_transform_that_cannot_be_are_refused(options, message):
 
 
 def test_a_study_counts_what_was_planted():
-    row = {"pair": None, "method": "validate", "role": None, "scene": "a"}
     detected, known, worst = "validate.scale_detected", "validate.known", "validate.called_right_wrong"
-    rows = [{**row, detected: 1.0, known: 0.5}, {**row, "scene": "b", detected: 0.5, known: None}]
-    rows += [{**row, "scene": "c", "role": "rotation", detected: 0.0}]
+    row = {"pair": None, "method": "validate", "role": None, "scene": "a"}
     window = {"scene": "a", "pair": [0, 19], "method": "causes"}
-    planted = [("unit_mm", "unit", "unit", 50.0), ("unit_m", "unit", None, 50.0), ("none", None, None, 0.0)]
-    planted += [
-        ("mirrored", "mirrored", "mirrored", 9.0),
-        ("mirrored", "mirrored", None, 1.0),
-        ("none", None, "roll", 0),
-    ]
     names = ("fault", "planted_kind", "named_kind", "moved_px")
-    rows += [{**window, **dict(zip(names, each, strict=True))} for each in planted]
-    found = validate_study.summarise_validation([*rows, {**rows[0], worst: 0.02}])
-    assert found[f"{worst}_worst"]["value"] == 0.02
+    rows = [
+        {**row, detected: 1.0, known: 0.5},
+        {**row, "scene": "b", detected: 0.5, known: None},
+        {**row, "scene": "c", "role": "rotation", detected: 0.0},
+        *(
+            {**window, **dict(zip(names, planted, strict=True))}
+            for planted in (
+                ("unit_mm", "unit", "unit", 50.0),
+                ("unit_m", "unit", None, 50.0),
+                ("none", None, None, 0.0),
+                ("mirrored", "mirrored", "mirrored", 9.0),
+                ("mirrored", "mirrored", None, 1.0),  # what moves less than two pixels does not count
+                ("none", None, "roll", 0),
+            )
+        ),
+    ]
     found = validate_study.summarise_validation(rows)
     expected = {detected: 0.75, known: 0.5, "validate.named.unit": 0.5, "validate.named.mirrored": 1.0}
-    expected |= {
-        "validate.named_worst": 0.5,
-        "validate.misnamed": 0.5,
-    }  # what moves less than two pixels does not count
+    expected |= {"validate.named_worst": 0.5, "validate.misnamed": 0.5}
     assert {name: found[name]["value"] for name in expected} == expected
     holds, why = validate_study.verdict(found)
     assert holds is False and "validate.scale_detected 0.750" in why and "not measured: " in why
+    found = validate_study.summarise_validation([*rows, {**rows[0], worst: 0.02}])
+    assert found[f"{worst}_worst"]["value"] == 0.02
     alarms = [[1.1, 1.05, 1.15], [1.1, 0.99, 1.2], [1.02, 1.01, 1.03], [math.nan] * 3]
     assert [validate_study.scale_alarm(torch.tensor(x)) for x in alarms] == [True, False, False, None]
 
