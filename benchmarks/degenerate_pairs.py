@@ -139,29 +139,20 @@ def _coplanar(pair: Pair) -> None:
     pair.near(pair.face == (seen.mode().values if len(seen) else 0))
 
 
-def _collinear(noise: float) -> Callable[[Pair], None]:
+def _collinear(pair: Pair, noise: float) -> None:
     """Half of the samples on one row of one plane; only there are returns, whose points lie on a line."""
-
-    def sweep(pair: Pair) -> None:
-        _coplanar(pair)
-        row = (pair.depth > 0).sum(1).argmax()
-        half = len(pair.uv) // 2
-        line = torch.stack((torch.linspace(3, HW[1] - 4, half).round(), row.float().expand(half)), -1)
-        pair.uv = torch.cat((line, pair.uv[half:]))
-        pair.depth = torch.where(pair.depth > 0, pair.truth * (1 + noise * torch.randn(HW, generator=pair.g)), 0)
-        pair.near((torch.arange(HW[0]) == row)[:, None].expand(HW))
-
-    return sweep
+    _coplanar(pair)
+    row = (pair.depth > 0).sum(1).argmax()
+    half = len(pair.uv) // 2
+    line = torch.stack((torch.linspace(3, HW[1] - 4, half).round(), row.float().expand(half)), -1)
+    pair.uv = torch.cat((line, pair.uv[half:]))
+    pair.depth = torch.where(pair.depth > 0, pair.truth * (1 + noise * torch.randn(HW, generator=pair.g)), 0)
+    pair.near((torch.arange(HW[0]) == row)[:, None].expand(HW))
 
 
 def _duplicated(pair: Pair) -> None:
     distinct = pair.uv[torch.randperm(len(pair.uv), generator=pair.g)[: pair.draw.randint(1, 6)]]
     pair.uv = distinct.repeat(len(pair.uv), 1)[: len(pair.uv)]
-
-
-def _passed(pair: Pair) -> None:
-    """View 1 stands beyond the near points: they are behind it."""
-    pair.look([0.0, 0.0, 0.0, 0.0, 0.0, -pair.draw.uniform(1.8, 2.4)])
 
 
 def _swapped(pair: Pair) -> None:
@@ -174,48 +165,28 @@ def _unrelated(pair: Pair) -> None:
     pair.image_1 = Room(pair.draw, pair.g).view(pair.room.start)[0]
 
 
-def _junk(*values: float, share: float = 0.3) -> Callable[[Pair], None]:
+def _junk(pair: Pair, *values: float, share: float = 0.3) -> None:
     """Some returns become one of the values."""
-
-    def spoil(pair: Pair) -> None:
-        pick = torch.tensor(values)[torch.randint(len(values), HW, generator=pair.g)]
-        pair.depth = torch.where(torch.rand(HW, generator=pair.g) < share, pick, pair.depth)
-
-    return spoil
+    pick = torch.tensor(values)[torch.randint(len(values), HW, generator=pair.g)]
+    pair.depth = torch.where(torch.rand(HW, generator=pair.g) < share, pick, pair.depth)
 
 
-def _blank(value: float, views: tuple[int, ...] = (0, 1)) -> Callable[[Pair], None]:
+def _blank(pair: Pair, value: float, views: tuple[int, ...] = (0, 1)) -> None:
     """Images of one value."""
-
-    def wipe(pair: Pair) -> None:
-        for view in views:
-            setattr(pair, f"image_{view}", torch.full((3, *HW), value))
-
-    return wipe
+    for view in views:
+        setattr(pair, f"image_{view}", torch.full((3, *HW), value))
 
 
-def _spots(value: float) -> Callable[[Pair], None]:
+def _spots(pair: Pair, value: float) -> None:
     """Some pixels of both images become one value."""
-
-    def spoil(pair: Pair) -> None:
-        for name in ("image_0", "image_1"):
-            hit = torch.rand(HW, generator=pair.g) < pair.draw.choice((1e-4, 0.01, 0.5))
-            setattr(pair, name, torch.where(hit, value, getattr(pair, name)))
-
-    return spoil
+    for name in ("image_0", "image_1"):
+        hit = torch.rand(HW, generator=pair.g) < pair.draw.choice((1e-4, 0.01, 0.5))
+        setattr(pair, name, torch.where(hit, value, getattr(pair, name)))
 
 
 def _saturated(pair: Pair) -> None:
     gain = pair.draw.uniform(2, 8)
     pair.image_0, pair.image_1 = (pair.image_0 * gain).clamp(0, 1), (pair.image_1 * gain).clamp(0, 1)
-
-
-def _huge_motion(pair: Pair) -> None:
-    pair.look([*_vector(pair.draw, pair.draw.uniform(0.3, 3)), *_vector(pair.draw, pair.draw.uniform(0.3, 1))])
-
-
-def _rotation(pair: Pair) -> None:
-    pair.look([*_vector(pair.draw, pair.draw.uniform(0.01, 0.06)), 0.0, 0.0, 0.0])
 
 
 def _noise(pair: Pair) -> None:
@@ -238,16 +209,12 @@ def _moving(pair: Pair) -> None:
     pair.image_1 = torch.cat((moved[..., :half], pair.image_1[..., half:]), -1)
 
 
-def _wrong_camera(low: float, high: float) -> Callable[[Pair], None]:
+def _wrong_camera(pair: Pair, low: float, high: float) -> None:
     """Focal lengths off by a factor in the range, principal points off by as many pixels."""
-
-    def mistake(pair: Pair) -> None:
-        factors = [torch.tensor([math.exp(pair.draw.uniform(low, high)) for _ in range(2)]) for _ in range(2)]
-        shifts = [torch.tensor([pair.draw.gauss(0, 10 * high) for _ in range(2)]) for _ in range(2)]
-        pair.f = (pair.f[0] * factors[0], pair.f[1] * factors[1])
-        pair.c = (pair.c[0] + shifts[0], pair.c[1] + shifts[1])
-
-    return mistake
+    factors = [torch.tensor([math.exp(pair.draw.uniform(low, high)) for _ in range(2)]) for _ in range(2)]
+    shifts = [torch.tensor([pair.draw.gauss(0, 10 * high) for _ in range(2)]) for _ in range(2)]
+    pair.f = (pair.f[0] * factors[0], pair.f[1] * factors[1])
+    pair.c = (pair.c[0] + shifts[0], pair.c[1] + shifts[1])
 
 
 def _not_a_camera(pair: Pair) -> None:
@@ -255,22 +222,14 @@ def _not_a_camera(pair: Pair) -> None:
     pair.f = (bad, pair.f[1]) if pair.draw.random() < 0.5 else (pair.f[0], bad)
 
 
-def _lens(scale: float) -> Callable[[Pair], None]:
+def _lens(pair: Pair, scale: float) -> None:
     """A distortion that the images do not have."""
-
-    def mistake(pair: Pair) -> None:
-        pair.lens = torch.tensor([pair.draw.gauss(0, scale) for _ in range(5)])
-
-    return mistake
+    pair.lens = torch.tensor([pair.draw.gauss(0, scale) for _ in range(5)])
 
 
-def _scaled(factor: float) -> Callable[[Pair], None]:
+def _scaled(pair: Pair, factor: float) -> None:
     """Depth in another unit, truth with it."""
-
-    def rescale(pair: Pair) -> None:
-        pair.depth, pair.truth = pair.depth * factor, pair.truth * factor
-
-    return rescale
+    pair.depth, pair.truth = pair.depth * factor, pair.truth * factor
 
 
 def _lie(pair: Pair) -> None:
@@ -293,39 +252,43 @@ KINDS: dict[str, Callable[[Pair], None]] = {
     "one near point": lambda pair: _some(pair, 1),
     "three near points": lambda pair: _some(pair, 3),
     "eight near points": lambda pair: _some(pair, 8),
-    "collinear": _collinear(0.0),
-    "collinear up to 1 % noise": _collinear(0.01),
+    "collinear": lambda pair: _collinear(pair, 0.0),
+    "collinear up to 1 % noise": lambda pair: _collinear(pair, 0.01),
     "coplanar": _coplanar,
     "duplicated points": _duplicated,
-    "points behind": _passed,
+    "points behind": lambda pair: pair.look(
+        [0.0, 0.0, 0.0, 0.0, 0.0, -pair.draw.uniform(1.8, 2.4)]
+    ),  # View 1 stands beyond the near points: they are behind it.
     "identical frames": lambda pair: setattr(pair, "image_1", pair.image_0.clone()),
-    "pure rotation": _rotation,
+    "pure rotation": lambda pair: pair.look([*_vector(pair.draw, pair.draw.uniform(0.01, 0.06)), 0.0, 0.0, 0.0]),
     "swapped frames": _swapped,
     "unrelated images": _unrelated,
-    "huge motion": _huge_motion,
+    "huge motion": lambda pair: pair.look(
+        [*_vector(pair.draw, pair.draw.uniform(0.3, 3)), *_vector(pair.draw, pair.draw.uniform(0.3, 1))]
+    ),
     "moving scene": _moving,
     "upside down": lambda pair: setattr(pair, "image_1", pair.image_1.flip(1, 2)),
     "mirrored": lambda pair: setattr(pair, "image_1", pair.image_1.flip(2)),
-    "NaN depth": _junk(NAN),
-    "all depth NaN": _junk(NAN, share=2.0),
-    "infinite depth": _junk(INF, -INF),
-    "tiny, huge, negative depth": _junk(-1.0, 1e-30, 1e-4, 1e30, 3e38),
+    "NaN depth": lambda pair: _junk(pair, NAN),
+    "all depth NaN": lambda pair: _junk(pair, NAN, share=2.0),
+    "infinite depth": lambda pair: _junk(pair, INF, -INF),
+    "tiny, huge, negative depth": lambda pair: _junk(pair, -1.0, 1e-30, 1e-4, 1e30, 3e38),
     "random depth": _lie,
-    "depth in mm": _scaled(1e3),
-    "depth in light years": _scaled(1e-16),
-    "constant images": _blank(0.5),
-    "black view 1": _blank(0.0, (1,)),
+    "depth in mm": lambda pair: _scaled(pair, 1e3),
+    "depth in light years": lambda pair: _scaled(pair, 1e-16),
+    "constant images": lambda pair: _blank(pair, 0.5),
+    "black view 1": lambda pair: _blank(pair, 0.0, (1,)),
     "saturated": _saturated,
     "noise images": _noise,
     "stripes": _stripes,
-    "NaN pixels": _spots(NAN),
-    "infinite pixels": _spots(INF),
-    "all pixels NaN": _blank(NAN, (0,)),
-    "wrong intrinsics": _wrong_camera(-0.7, 0.7),
-    "absurd intrinsics": _wrong_camera(-5.0, 5.0),
+    "NaN pixels": lambda pair: _spots(pair, NAN),
+    "infinite pixels": lambda pair: _spots(pair, INF),
+    "all pixels NaN": lambda pair: _blank(pair, NAN, (0,)),
+    "wrong intrinsics": lambda pair: _wrong_camera(pair, -0.7, 0.7),
+    "absurd intrinsics": lambda pair: _wrong_camera(pair, -5.0, 5.0),
     "no intrinsics": _not_a_camera,
-    "wrong lens": _lens(0.3),
-    "absurd lens": _lens(1e3),
-    "lens of NaN": _lens(NAN),
+    "wrong lens": lambda pair: _lens(pair, 0.3),
+    "absurd lens": lambda pair: _lens(pair, 1e3),
+    "lens of NaN": lambda pair: _lens(pair, NAN),
     "samples outside": _outside,
 }

@@ -1,17 +1,15 @@
-"""Time per frame of stages 1 to 3, against numpy + OpenCV and against a forward pass of DINOv2-L.
+"""Time per frame of stages 1 to 3, against numpy + OpenCV.
 
     python benchmarks/frontend.py --json benchmarks/results/frontend.json
 
 One view of the built-in room with its LiDAR model (depth 192x256 with confidence), the picture resampled to 224x224 and
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
-which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages with calls in C++
-(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.ops``.
+which depends on the picture's size alone. Mode ``compiled`` uses the compiled code of ``python -m dhtorch.ops``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -24,7 +22,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dhtorch.codes import Flag, Hole
-from dhtorch.experiments.baselines import dinov2
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.patches import luma
 from dhtorch.metrics import holdout
@@ -116,15 +113,6 @@ def exact_trackability(frame: Frame, n: int) -> Tensor:
     return torch.from_numpy(whole)[v, u]
 
 
-def compiled(call: Callable[..., Samples], *args: Any) -> tuple[Callable[[], Samples], float]:
-    """The call compiled for its arguments, and the seconds that took."""
-    torch.compiler.reset()
-    fast = partial(torch.compile(call, options={"cpp_wrapper": True}), *args)
-    start = time.perf_counter()
-    fast()
-    return fast, time.perf_counter() - start
-
-
 def agreement(samples: Samples, peer: list[dict[str, Any]]) -> str:
     """In words, how far both sides say the same."""
     hole, flag = (torch.from_numpy(np.stack([p[k] for p in peer])) for k in ("hole", "flag"))
@@ -134,7 +122,7 @@ def agreement(samples: Samples, peer: list[dict[str, Any]]) -> str:
     return f"same class {same[0]:.4f}, same flags {same[1]:.4f}, xyz within {apart:.1g} m"
 
 
-def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> list[dict[str, Any]]:
+def measure(size: str, n: int, batch: int, options: Any) -> list[dict[str, Any]]:
     """Rows of one size: eager and compiled against OpenCV."""
     frame = view(SIZES[size], batch)
     peer = OpenCVFrontEnd(frame, n)
@@ -143,10 +131,6 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
         partial(front_end, frame, n),
         partial(harness.with_compiled_operators()(front_end), frame, n),
     ]
-    seconds = 0.0
-    if compile_too:
-        fast, seconds = compiled(front_end, frame, n)
-        calls.append(fast)
     times = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=20)
     times = [[t / batch for t in side] for side in times]
     exact = exact_trackability(frame, n)
@@ -156,47 +140,12 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
         ((x - exact).abs() / exact.clamp_min(1e-8)).median().item()
         for x in (calls[1]().trackability[0], torch.from_numpy(theirs[0]["trackability"]))
     ]
-    print(f"{name}: {agreement(calls[1](), theirs)}" + (f"; compiled in {seconds:.0f} s" if compile_too else ""))
+    print(f"{name}: {agreement(calls[1](), theirs)}")
     more = {"n": n, "batch": batch, "bar": True, "ours_error": errors[0], "peer_error": errors[1]}
-    rows = [
-        harness.row(name, times[k], "numpy_opencv", times[0], **more, mode=("eager", "compiled")[k - 1]) for k in (1, 2)
-    ]
-    if compile_too:
-        rows.append(
-            harness.row(name, times[3], "numpy_opencv", times[0], **more, mode="torch.compile", warm_up_s=seconds)
-        )
-    return rows
-
-
-def against_dinov2(options: Any) -> list[dict[str, Any]]:
-    """Rows of the front end at 224x224 beside a forward pass of DINOv2-L."""
-    frame = view(SIZES["224"])
-    try:
-        network = dinov2.load_dinov2()
-    except ImportError as error:
-        print(f"dinov2_l: skipped, {error}")
-        return []
-    pixels = dinov2.preprocess_image(frame.image)
-    fast, seconds = compiled(front_end, frame, 1024)
-    calls = [partial(front_end, frame, 1024), fast, partial(network, pixel_values=pixels)]
-    times = harness.in_turn(calls, repeats=max(options.repeats // 3, 4), warm_up=1, clock=options.clock, least_ms=20)
-    eager = harness.row("frontend_224", times[0], "dinov2_l", times[2], n=1024)
     return [
-        eager,
-        harness.row("frontend_224", times[1], "dinov2_l", times[2], n=1024, mode="torch.compile", warm_up_s=seconds),
+        harness.row(name, times[k], "numpy_opencv", times[0], **more, mode=mode)
+        for k, mode in ((1, "eager"), (2, "compiled"))
     ]
-
-
-def growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the time at 1440x1920 beside the own time at 224x224."""
-    grown = []
-    for mode in ("eager", "compiled", "torch.compile"):
-        small, large = ([r for r in rows if r["name"] == f"frontend_{s}" and r["mode"] == mode] for s in SIZES)
-        if small and large:
-            a, b = large[0]["ours_ms"], small[0]["ours_ms"]
-            more = {"ours_ms": a, "peer": "own_224", "peer_ms": b, "ratio": a / b, "peer_error": None, "bar": False}
-            grown.append({**large[0], **more})
-    return grown
 
 
 def main() -> None:
@@ -206,15 +155,13 @@ def main() -> None:
     with torch.no_grad():
         for threads in (1, 2):
             harness.set_threads(threads)
-            sizes = [(size, 1024, 1) for size in SIZES]
+            sizes = [(name, 1024, 1) for name in SIZES]
             if options.full or threads == 1:
                 sizes += [("224", 2048, 1), ("224", 1024, 64)]
             if options.full:
                 sizes += [("1440", 2048, 1), ("1440", 1024, 64)]
-            part = []
-            for size, n, batch in sizes:
-                part += measure(size, n, batch, options, compile_too=(n, batch) == (1024, 1))
-            rows += part + growth(part) + against_dinov2(options)
+            for size in sizes:
+                rows += measure(*size, options)
     print(f"milliseconds per frame, medians of {options.repeats} ({options.clock} clock)")
     harness.report(rows, options.json)
 

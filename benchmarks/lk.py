@@ -3,9 +3,7 @@
     python benchmarks/lk.py --json benchmarks/results/lk.json
 
 *Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for a reference
-view seen from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile``
-would unroll every map that the eager search makes for few points only, and was not compiled after 400 s. Mode
-``native`` uses ``python -m dhtorch.ops``. *Forward-backward* is
+view seen from many views. Mode ``compiled`` uses ``python -m dhtorch.ops``. *Forward-backward* is
 ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
 else of the built-in room; both sides take turns in one process.
 
@@ -14,12 +12,9 @@ Errors of forward-backward rows: share of points of the real pairs on which the 
 """
 
 import os
-import time
-from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import cv2
 import harness
@@ -89,18 +84,6 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
     return (x + d).reshape(2, B, N).permute(1, 2, 0), valid.reshape(B, N)
 
 
-@cache
-def compiled_steps() -> Callable[..., Any]:
-    """The part of the search that is many small operations on the same numbers, compiled for any number of points."""
-    return torch.compile(lk._on_map, dynamic=True)
-
-
-def forward_compiled(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
-    """:func:`forward` with :func:`compiled_steps`."""
-    with mock.patch.object(lk, "_on_map", compiled_steps()):
-        return forward(image_0, image_1, uv, window)
-
-
 def forward_opencv(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
     """The same by OpenCV, pair after pair."""
     options: Any = {"winSize": (window, window), "maxLevel": LEVELS - 1, "criteria": (3, 30, 0.01)}
@@ -128,17 +111,16 @@ def warped(images: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.stack(moved))[:, None], torch.from_numpy(np.stack(truth))
 
 
-def accuracy(images: Tensor, uv: Tensor, window: int) -> list[tuple[float, float]]:
-    """Ours and OpenCV's misses (share beyond 1 px) and median distance, of points that stay inside the image."""
-    moved, truth = warped(images, uv)
-    high = torch.tensor([images.shape[-1] - 1, images.shape[-2] - 1])
+def misses(image: Tensor, uv: Tensor, window: int) -> list[float]:
+    """Fraction of points that stay inside the image and are found more than 1 px off: ours, compiled, and OpenCV's."""
+    moved, truth = warped(image, uv)
+    high = torch.tensor([image.shape[-1] - 1, image.shape[-2] - 1])
     inside = ((truth >= 0) & (truth <= high)).all(-1)
     results = []
-    for method in (forward, forward_opencv):
-        uv_1, ok = method(images, moved, uv, window)
-        distance = (uv_1 - truth).norm(dim=-1)
-        missed = ~ok.bool() | (distance > 1)
-        results.append((missed[inside].double().mean().item(), distance[inside].median().item()))
+    for method in (forward, harness.with_compiled_operators()(forward), forward_opencv):
+        uv_1, ok = method(image, moved, uv, window)
+        missed = ~ok.bool() | ((uv_1 - truth).norm(dim=-1) > 1)
+        results.append(missed[inside].double().mean().item())
     return results
 
 
@@ -150,41 +132,31 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     kept = PyramidCache(image_0)
     reference = kept(LEVELS, window)
     options: Any = {"window": window, "levels": LEVELS}
-    calls = [
-        partial(forward, *views, window),
-        partial(forward, *views, window, reference),
-        partial(forward_opencv, *views, window),
-        partial(track.lucas_kanade, *views, **options),
-        partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
-        partial(opencv.opencv_lucas_kanade, *views, **options),
-        partial(harness.with_compiled_operators()(forward), *views, window),
-        partial(harness.with_compiled_operators()(track.lucas_kanade), *views, **options),
-        partial(forward_compiled, *views, window),
-    ]
-    begin = time.perf_counter()
-    calls[-1]()
-    warm_up = time.perf_counter() - begin
-    times = [[t / batch for t in side] for side in harness.in_turn(calls, repeats=repeats, warm_up=2)]
-    (missed, median), (peer_missed, peer_median) = accuracy(image_0, uv, window)
-    differ, differ_compiled = ((calls[k]().valid != calls[5]().valid).double().mean().item() for k in (3, 7))
-    print(
-        f"{suffix[1:]}: misses {missed:.4f}, OpenCV {peer_missed:.4f}; median distance {median:.4f}, {peer_median:.4f}"
-        f" px; same verdict {1 - differ:.3f}; first compiled call {warm_up:.1f} s"
-    )
-    common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
-    more = {"mode": "torch.compile", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
-    there_work, both_work = (work(n, window, tuple(image_0.shape[-2:]), ways) for ways in (1, 2))
-    rows = [harness.row(f"lk{suffix}", times[8], "opencv", times[2], work=there_work, **more)]
-    with harness.with_compiled_operators():
-        (missed_compiled, _), _ = accuracy(image_0, uv, window)
-    errors = (missed, differ), (missed, differ), (missed_compiled, differ_compiled)
-    for (there, back), mode, (lost, other) in zip(
-        ((0, 3), (1, 4), (6, 7)), ("eager", "cached", "compiled"), errors, strict=True
-    ):
-        more = {"mode": mode, **common, "ours_error": lost, "peer_error": peer_missed}
-        rows.append(harness.row(f"lk{suffix}", times[there], "opencv", times[2], work=there_work, **more))
-        more = {"mode": mode, **common, "ours_error": other}
-        rows.append(harness.row(f"lk_fb{suffix}", times[back], "opencv", times[5], work=both_work, **more))
+    compiled = harness.with_compiled_operators()
+    calls = {
+        "lk eager": partial(forward, *views, window),
+        "lk cached": partial(forward, *views, window, reference),
+        "lk compiled": partial(compiled(forward), *views, window),
+        "lk opencv": partial(forward_opencv, *views, window),
+        "lk_fb eager": partial(track.lucas_kanade, *views, **options),
+        "lk_fb cached": partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
+        "lk_fb compiled": partial(compiled(track.lucas_kanade), *views, **options),
+        "lk_fb opencv": partial(opencv.opencv_lucas_kanade, *views, **options),
+    }
+    durations = harness.in_turn([*calls.values()], repeats=repeats, warm_up=2)
+    times = {name: [t / batch for t in side] for name, side in zip(calls, durations, strict=True)}
+    missed, missed_compiled, peer_missed = misses(image_0, uv, window)
+    theirs = calls["lk_fb opencv"]().valid
+    rows = []
+    for name, ways in (("lk", 1), ("lk_fb", 2)):
+        for mode in ("eager", "cached", "compiled"):
+            errors = {"ours_error": missed_compiled if mode == "compiled" else missed, "peer_error": peer_missed}
+            if ways == 2:
+                errors = {"ours_error": (calls[f"lk_fb {mode}"]().valid != theirs).double().mean().item()}
+            more: dict[str, Any] = {"mode": mode, "n": n, "batch": batch, "bar": window == 21, **errors}
+            least = work(n, window, tuple(image_0.shape[-2:]), ways)
+            both = times[f"{name} {mode}"], "opencv", times[f"{name} opencv"]
+            rows.append(harness.row(name + suffix, *both, work=least, **more))
     return rows
 
 

@@ -307,6 +307,17 @@ class Estimate(Record):
         """Lower and upper end (B, N) of :func:`depth_interval`, m; NaN where unanswered."""
         return depth_interval(self.depth, self.sigma, k)
 
+    def withheld(self, rejected: Tensor, gate: int) -> "Estimate":
+        """The estimate without the ``rejected`` (…, N) answers, which get ``gate``. Gradient: as that of the others."""
+        lost = self.keep & rejected
+        return self.replace(
+            depth=self.depth.masked_fill(lost, torch.nan),
+            sigma=self.sigma.masked_fill(lost, torch.nan),
+            sigma_shared=self.sigma_shared.masked_fill(lost, torch.nan),
+            score=self.score.masked_fill(lost, 0.0),
+            gate=self.gate.masked_fill(lost, gate),
+        )
+
     @classmethod
     def unanswered(cls, samples: Samples, gate: int, *, n_views: int) -> "Estimate":
         """An estimate in which every sample is unanswered, rejected by the same gate."""

@@ -185,18 +185,24 @@ def test_no_module_shadows_the_standard_library_or_its_own_function():
         assert not (path.stem in functions and path.stem in exported and path.parent == ROOT), path
 
 
+#: Functions that run a kernel by its name.
+RUNNERS = ("run_kernel", "run_window_kernel")
+
+
 def functions_that_run_operators(tree):
-    """Of a module: names of functions that name ``torch.ops.dhtorch`` (None outside any), and of those passed to the
-    dispatch as kernels."""
+    """Of a module: names of functions that name ``torch.ops.dhtorch`` or run a kernel by its name (None outside any), and
+    of those passed to the dispatch as kernels; with those that a kernel written there calls."""
     inside, kernels = set(), set()
     scopes = [(None, node) for node in tree.body]
     while scopes:
         name, node = scopes.pop()
         name = node.name if name is None and isinstance(node, ast.FunctionDef) else name
-        if isinstance(node, ast.Attribute) and ast.unparse(node) == "torch.ops.dhtorch":
+        if isinstance(node, ast.Attribute | ast.Name) and ast.unparse(node) in ("torch.ops.dhtorch", *RUNNERS):
             inside.add(name)
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "operator":
-            kernels |= {ast.unparse(word.value) for word in node.keywords if word.arg == "kernel"}
+            values = [word.value for word in node.keywords if word.arg == "kernel"]
+            kernels |= {name.id for value in values for name in ast.walk(value) if isinstance(name, ast.Name)}
+            continue
         scopes += [(name, child) for child in ast.iter_child_nodes(node)]
     return inside, kernels
 
@@ -215,7 +221,8 @@ def test_compiled_operators_run_through_the_dispatch_alone(path):
     relative = path.relative_to(ROOT)
     imported = {name for name, _ in imports(path) if name.startswith("dhtorch.ops")}
     assert all(
-        name in ("dhtorch.ops.dispatch.operator", "dhtorch.ops.loader") or name.startswith("dhtorch.ops.constants.")
+        name in ("dhtorch.ops.dispatch.operator", "dhtorch.ops.dispatch.run_kernel", "dhtorch.ops.loader")
+        or name.startswith("dhtorch.ops.constants.")
         for name in imported
     )
     assert {*re.findall(r"\bloader\.(\w+)", path.read_text())} <= {
@@ -223,12 +230,13 @@ def test_compiled_operators_run_through_the_dispatch_alone(path):
     } or "dhtorch.ops.loader" not in imported
     tree = parsed(path)
     inside, kernels = functions_that_run_operators(tree)
-    for name in inside - kernels:
+    for name in inside - kernels - {*RUNNERS}:
         assert name is not None and callers_of(tree, name), f"{relative}: {name} is no kernel"
         assert callers_of(tree, name) <= kernels, f"{relative}: {name} is no kernel"
 
 
 def test_every_compiled_operator_has_a_kernel_that_runs_it():
-    named = {m for path in FILES for m in re.findall(r"torch\.ops\.dhtorch\.(\w+)", path.read_text())}
+    pattern = r"(?:torch\.ops\.dhtorch\.|run_(?:window_)?kernel\(\s*\")(\w+)"
+    named = {m for path in FILES for m in re.findall(pattern, path.read_text())}
     defined = {m for path in ROOT.glob("ops/csrc/*.cpp") for m in re.findall(r'm\.impl\("(\w+)"', path.read_text())}
     assert named - {"scale"} == defined, "scale is the example of the dispatch"

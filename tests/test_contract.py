@@ -217,19 +217,14 @@ def problems(batch, n, dtype):
 
 def linear(batch, n, dtype):
     problem, at, noise = problems(batch, n, dtype)
-    return problem, reprojection_problem.linearise_tracks(problem, at), noise
+    tracks = reprojection_problem.linearise_tracks(problem, at)
+    return tracks, reprojection_problem.noise_factors(tracks.fixed, noise)
 
 
 def weighed(batch, n, dtype):
     problem, at, noise = problems(batch, n, dtype)
     weights = uniform(batch, dtype=dtype), uniform(batch, dtype=dtype, low=1e4, high=1e5)
     return problem, at, noise, *weights
-
-
-def nine(batch, n, dtype):
-    A = uniform(batch, 9, 12, dtype=dtype)
-    at = reprojection_problem.Unknowns(poses(batch, dtype), uniform(batch, 3, dtype=dtype))
-    return at, A @ A.mT + 0.1 * torch.eye(9, dtype=dtype), uniform(batch, 9, dtype=dtype)
 
 
 def triples(batch, n, dtype):
@@ -447,22 +442,19 @@ ROWS = [
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.reprojection_residuals, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.robust_loss, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
-    Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
-    Row(least_squares.trial_pose_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch capture raises", bad=wrong_last_axis(2)),
     Row(least_squares.solve_spd, lambda b, n, d: (positive(b, n, d), uniform(b, 6, 1, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.normal_equations, lambda b, n, d: (uniform(b, 7, 2, n - n % 16 + 16, dtype=d), uniform(b, n - n % 16 + 16, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
     Row(least_squares.move_pose, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(least_squares.select_batch, lambda b, n, d: (uniform(b, dtype=d) > 0.5, poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(1, 2)),
     Row(least_squares.robust_weight_slope, lambda b, n, d: (uniform(b, n, dtype=d), "geman_mcclure", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(least_squares.implicit_step, lambda b, n, d: (torch.sin, uniform(b, 6, dtype=d, low=-0.2, high=0.2)), "dtype batch capture"),
-    Row(reprojection_problem.retract_unknowns, lambda b, n, d: (nine(b, n, d)[0], uniform(b, 9, dtype=d, low=-0.2, high=0.2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
-    Row(reprojection_problem.unknowns_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
-    Row(reprojection_problem.trial_unknowns_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
+    Row(reprojection_problem.retract_unknowns, lambda b, n, d: (reprojection_problem.Unknowns(poses(b, d), uniform(b, 3, dtype=d)), uniform(b, 9, dtype=d, low=-0.2, high=0.2)), "dtype batch vmap capture"),
     Row(reprojection_problem.undo_rolling_shutter, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),
     Row(reprojection_problem.track_constants, lambda b, n, d: problems(b, n, d)[:1], "dtype batch vmap capture"),
     Row(reprojection_problem.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
-    Row(reprojection_problem.whitened_residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
-    Row(reprojection_problem.squared_residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
+    Row(reprojection_problem.noise_factors, lambda b, n, d: (linear(b, n, d)[0].fixed, problems(b, n, d)[2]), "dtype batch vmap capture gradcheck", grad=(1,)),
+    Row(reprojection_problem.whitened_residuals, linear, "dtype batch vmap capture gradcheck", grad=(1,)),
+    Row(reprojection_problem.squared_residuals, linear, "dtype batch vmap capture gradcheck", grad=(1,)),
     Row(with_options(reprojection_problem.pose_normal_equations, kernel="geman_mcclure", bend=2.0), weighed, "dtype batch vmap capture"),
     Row(reprojection_problem.shutter_prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
     Row(reprojection_problem.estimate_noise_variance, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
@@ -546,7 +538,7 @@ ELSEWHERE = {
     ),
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
-    *(f"dhtorch.geometry.patches.{name}" for name in ("fits_window_kernel", "window_arguments")),
+    *(f"dhtorch.geometry.patches.{name}" for name in ("fits_window_kernel", "run_window_kernel")),
     *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("new_cost_volume", "planes_last")),
     "dhtorch.geometry.reprojection_problem.squared_residuals_at",
     "dhtorch.geometry.windows.row_bands",
@@ -557,6 +549,7 @@ ELSEWHERE = {
         for name in (
             "all_finite",
             "check",
+            "shaped",
             "is_static",
             "is_transformed",
             "any_possible",
@@ -966,13 +959,12 @@ def test_wrong_shapes_raise(row):
 #: Function -> positions of arguments that may have another batch size: without use, with leading axes of any number, or
 #: not checked before another function.
 OTHER_BATCH = {
-    pose.pnp_ransac: (2,),
-    pose_prior.check_pose_prior: (3,),
-    reprojection_problem.whitened_residuals: (0, 1),
-    reprojection_problem.squared_residuals: (0, 1),
-    track_chain.track_chain: (0, 1),
-} | dict.fromkeys((score.confidence, score.confidence_from_error, score.confidence_from_sigma), (3,))
-OTHER_BATCH |= dict.fromkeys((probe.join_moments, probe.solve_ridge, probe.predict_targets), (0, 1))
+    "pnp_ransac": (2,),
+    "check_pose_prior": (3,),
+    "track_chain": (0, 1),
+    **dict.fromkeys(("confidence", "confidence_from_error", "confidence_from_sigma"), (3,)),
+    **dict.fromkeys(("join_moments", "solve_ridge", "predict_targets"), (0, 1)),
+}
 
 
 @named("raises")
@@ -980,7 +972,7 @@ def test_another_batch_in_one_argument_raises(row):
     args = row.make(2, 9, torch.float32)
     batched = [k for k, a in enumerate(args) if any(v.shape[:1] == (2,) for v in leaves(a)) and k not in row.shared]
     for position in batched if len(batched) > 1 else ():
-        if position not in OTHER_BATCH.get(inspect.unwrap(row.fn), ()):
+        if position not in OTHER_BATCH.get(row.fn.__name__, ()):
             longer = tensor_map(lambda v: torch.cat((v, v[:1])) if v.shape[:1] == (2,) else v, args[position])
             with pytest.raises(ValueError, match="expected"):
                 row.fn(*args[:position], longer, *args[position + 1 :])

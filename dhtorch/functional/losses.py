@@ -11,7 +11,7 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, check
+from dhtorch.geometry.checks import all_finite, shaped
 from dhtorch.geometry.least_squares import MIN_DEPTH, robust_loss
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
@@ -62,6 +62,10 @@ def sigma_weighted_depth_loss(
     return _reduce(robust_loss(residual * residual, kernel, scale)[0], used, reduction)
 
 
+@shaped(
+    "depth_0: B N, uv_0: B N 2, uv_1: B N 2, cov: B N 2 2, keep: B N, T_1_from_0.R: B 3 3, T_1_from_0.t: B 3, "
+    "camera_0.f: B 2, camera_1.f: B 2"
+)
 def reprojection_loss(
     depth_0: Tensor,  # (B, N) m, z in camera 0; NaN or ≤ 0 = none
     uv_0: Tensor,  # (B, N, 2) px, of the reference view as it is, lens included
@@ -102,11 +106,7 @@ def reprojection_loss(
     a weight and gets none.
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 4.2.8 (Mahalanobis distance of pixels).
     """
-    name = "reprojection_loss"
-    check(name, depth_0=(depth_0, "B N"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f=(camera_0.f, "B 2"))
-    check(name, uv_1=(uv_1, "B N 2"), R=(T_1_from_0.R, "B 3 3"), t=(T_1_from_0.t, "B 3"), f=(camera_1.f, "B 2"))
-    check(name, uv_1=(uv_1, "B N 2"), cov=(cov, "B N 2 2"), keep=(keep, "B N"))
-    _check_equal_shapes(name, depth_0=depth_0, keep=keep)
+    _check_equal_shapes("reprojection_loss", depth_0=depth_0, keep=keep)
     posed = T_1_from_0.R.isfinite().flatten(1).all(-1) & all_finite(T_1_from_0.t, -1)
     eye = torch.eye(3).to(T_1_from_0.R)
     T = Pose(torch.where(posed[:, None, None], T_1_from_0.R, eye), torch.where(posed[:, None], T_1_from_0.t, eye[2]))
@@ -125,6 +125,7 @@ def reprojection_loss(
     return _reduce(robust_loss(quadratic_form(du, dv, *inverse), kernel, scale)[0], used, reduction)
 
 
+@shaped("confidence: B N, error: B N, keep: B N")
 def risk_coverage_loss(
     confidence: Tensor,  # (B, N), any numbers that order the answers of a set, such as -ln(expected error)
     error: Tensor,  # (B, N) relative error, counted as 1 where larger
@@ -156,7 +157,6 @@ def risk_coverage_loss(
     sum over answers; soft ranks as in T. Qin, T. Liu, H. Li, "A general approximation framework for direct optimization
     of information retrieval measures", 2010.
     """
-    check("risk_coverage_loss", confidence=(confidence, "B N"), error=(error, "B N"), keep=(keep, "B N"))
     if not temperature > 0:
         raise ValueError(f"risk_coverage_loss: temperature is {temperature}, expected a positive number")
     used = torch.ones_like(error, dtype=torch.bool) if keep is None else keep

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dhtorch.codes import Source
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.runtime.numerics import standard_numerics
 
 #: m, depth of the last code of channel 0; the first is 255 times as far, 63.75 m. Source: derived: half a code is 0.8 %
@@ -56,6 +56,7 @@ class GeometryImage(NamedTuple):
 
 
 @standard_numerics
+@shaped("depth: * H W, sigma: * H W, source: * H W")
 def geometry_image(
     depth: Tensor,  # (*, H, W) m; 0 or not finite = none
     sigma: Tensor,  # (*, H, W) m; 0 or not finite = unknown
@@ -79,7 +80,6 @@ def geometry_image(
         >>> geometry_image(depth, sigma, torch.tensor([[1, 3, 0]]))[:, 0].tolist()
         [[128, 32, 0], [86, 145, 0], [32, 96, 0]]
     """
-    check("geometry_image", depth=(depth, "* H W"), sigma=(sigma, "* H W"), source=(source, "* H W"))
     valid = torch.isfinite(depth) & (depth > 0) & (source != Source.NONE)
     z = torch.where(valid, depth.to(torch.promote_types(depth.dtype, torch.float32)), 1.0)
     red = torch.round(_LAST * NEAREST_M / z).clamp(1, _LAST)
@@ -92,6 +92,7 @@ def geometry_image(
 
 
 @standard_numerics
+@shaped("image: * 3 H W")
 def decode_geometry_image(
     image: Tensor,  # (*, 3, H, W) uint8, or floating point in [0, 1]
 ) -> GeometryImage:
@@ -114,7 +115,6 @@ def decode_geometry_image(
         >>> maps.depth, maps.source.tolist()
         (tensor([[0.4980, 1.9922, 0.0000]]), [[1, 3, 0]])
     """
-    check("decode_geometry_image", image=(image, "* 3 H W"))
     codes = torch.round(image * _LAST) if image.is_floating_point() else image.to(torch.float32)
     red, green, blue = codes.unbind(-3)
     source = torch.round(blue / SOURCE_STEP).to(torch.int32)
@@ -125,6 +125,7 @@ def decode_geometry_image(
 
 
 @standard_numerics
+@shaped("depth: * H W, K: * 3 3, distortion: * k")
 def point_cloud(
     depth: Tensor,  # (*, H, W) m; 0 or not finite = none
     K: Tensor,  # (*, 3, 3) or (3, 3) px, of the map
@@ -158,10 +159,12 @@ def point_cloud(
     """
     if n < 1:
         raise ValueError(f"point_cloud: n: found {n}, expected at least 1")
-    check("point_cloud", depth=(depth, "* H W"), K=(K, "* 3 3"), distortion=(distortion, "* k"))
     batch, (h, w) = depth.shape[:-2], depth.shape[-2:]
     flat = depth.reshape(-1, h * w)
-    order = _pixel_order(h, w, depth.device)
+    # Pixels in an order whose first ones cover the image evenly.
+    v = torch.arange(h, device=depth.device)[:, None]
+    u = torch.arange(w, device=depth.device)
+    order = ((v * _ROW_STEP + u * _COLUMN_STEP) % 2**32).reshape(-1).argsort(stable=True)
     valid = (torch.isfinite(flat) & (flat > 0))[:, order]
     count = valid.sum(1, keepdim=True)
     first = order[torch.argsort((~valid).to(torch.uint8), dim=1, stable=True)]  # pixels with a depth, in order, first
@@ -171,10 +174,3 @@ def point_cloud(
     flat_K = K.to(depth).expand(*batch, 3, 3).reshape(-1, 3, 3)
     lens = None if distortion is None else distortion.to(depth).expand(*batch, -1).reshape(-1, distortion.shape[-1])
     return cam.unproject(cam.from_matrix(flat_K, lens), uv, z).reshape(*batch, n, 3)
-
-
-def _pixel_order(h: int, w: int, device: torch.device) -> Tensor:
-    """Indices (h · w,) of the pixels in an order whose first ones cover the image evenly."""
-    v = torch.arange(h, device=device)[:, None]
-    u = torch.arange(w, device=device)
-    return ((v * _ROW_STEP + u * _COLUMN_STEP) % 2**32).reshape(-1).argsort(stable=True)

@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import linalg as closed_form
-from dhtorch.geometry.checks import any_possible, check, constant, is_static
+from dhtorch.geometry.checks import any_possible, constant, is_static, shaped
 from dhtorch.geometry.determinism import MAX_CHUNK_POINTS, chunk_size
 from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
@@ -100,6 +100,7 @@ class _State(NamedTuple):
     inverse: Tensor  # (2, 8, M) rows of the inverse normal equations, for the motion of the point in the window
 
 
+@shaped("uv_0: B N 2, uv_1: B N 2, wanted: B N, source.levels.0: B C H W, target.levels.0: B c h w")
 def register_affine(
     source: Pyramid,
     target: Pyramid,
@@ -142,10 +143,7 @@ def register_affine(
     Gradient: none; apply :func:`registration_step` to the result.
     Cost: one patch of image 1 per point, and 441 samples of it per point and step.
     """
-    B, N = (
-        check("register_affine", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN"
-    )
-    _check_pyramids("register_affine", source, target, uv_0)
+    B, N, _ = uv_0.shape
     with torch.no_grad():
         xy_0, xy_1, batch, usable = _flatten_points(source, target, uv_0, uv_1)
         if wanted is not None:
@@ -167,6 +165,7 @@ def register_affine(
     return AffineRegistration(torch.where(ok[..., None], registered, uv_1.detach()), linear, rms, cov, shift_px, ok)
 
 
+@shaped("uv_0: B N 2, uv_1: B N 2, linear: B N 2 2, source.levels.0: B C H W, target.levels.0: B c h w")
 def registration_step(
     source: Pyramid,
     target: Pyramid,
@@ -186,11 +185,7 @@ def registration_step(
 
     Gradient: to both pyramids and ``uv_0``; ``uv_1`` and ``linear`` are detached.
     """
-    B, N = (
-        check("registration_step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k]
-        for k in "BN"
-    )
-    _check_pyramids("registration_step", source, target, uv_0)
+    B, N, _ = uv_0.shape
     xy_0, xy_1, batch, usable = _flatten_points(source, target, uv_0, uv_1)
     q = round_half_up(xy_0)
     point = _window_coordinates(xy_0 - q, window)
@@ -204,11 +199,6 @@ def registration_step(
     warp = _compose(warp, _warp_change(solution[..., 0]), window)
     xy = torch.where(usable & solved, (warp * point[:, None]).sum(0), xy_1)
     return xy.T.reshape(B, N, 2).to(uv_0.dtype)
-
-
-def _check_pyramids(where: str, source: Pyramid, target: Pyramid, uv_0: Tensor) -> None:
-    """Raise a ValueError unless both pyramids have as many images as there are pairs of points (B, N, 2)."""
-    check(where, uv_0=(uv_0, "B N 2"), source=(source.levels[0], "B C H W"), target=(target.levels[0], "B c H_1 W_1"))
 
 
 def _flatten_points(

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import all_known, check, constant
+from dhtorch.geometry.checks import all_known, constant, shaped
 from dhtorch.geometry.linalg import inverse_2x2
 from dhtorch.geometry.se3 import Pose
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
@@ -99,9 +99,9 @@ class Camera(Record):
         return PinholeCamera(K, extrinsics, *(self.f.new_full((len(self.f),), float(side)) for side in hw))
 
 
+@shaped("K: B 3 3, distortion: B k", "camera.from_matrix")
 def from_matrix(K: Tensor, distortion: Tensor | None = None, readout: Tensor | None = None) -> Camera:
     """Camera of an intrinsic matrix (B, 3, 3) without skew."""
-    check("camera.from_matrix", K=(K, "B 3 3"), distortion=(distortion, "B k"))
     return Camera(K.diagonal(dim1=1, dim2=2)[:, :2].contiguous(), K[:, :2, 2], distortion, readout)
 
 
@@ -132,6 +132,7 @@ def resize_pixels(uv: Tensor, hw: tuple[int, int], new_hw: tuple[int, int]) -> T
     return (uv + 0.5) * s - 0.5
 
 
+@shaped("camera.f: B 2, A: B 3 3", "camera.warp")
 def warp(camera: Camera, A: Tensor) -> tuple[Camera, Tensor]:
     """Camera of the image whose pixel ``u`` moved to ``A u``, and what its axes did, for affine A (B, 3, 3) px.
 
@@ -141,7 +142,6 @@ def warp(camera: Camera, A: Tensor) -> tuple[Camera, Tensor]:
 
     Gradient: to the intrinsics and A.
     """
-    check("camera.warp", f=(camera.f, "B 2"), A=(A, "B 3 3"))
     linear = A[:, :2, :2] * camera.f[:, None]
     f = torch.linalg.vector_norm(linear, dim=-1)
     q = linear / f[..., None]
@@ -155,6 +155,7 @@ def warp(camera: Camera, A: Tensor) -> tuple[Camera, Tensor]:
     return camera.replace(f=f, c=c, distortion=distortion), Q
 
 
+@shaped("camera.f: B 2, xyz: B N 3", "camera.project")
 def project(
     camera: Camera,
     xyz: Tensor,  # (B, N, 3) m
@@ -166,12 +167,12 @@ def project(
     Gradient: to points, intrinsics and distortion. Checked against ``cv2.projectPoints`` and
     ``kornia.geometry.camera.PinholeCamera`` (``tests/geometry/test_camera.py``).
     """
-    check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     z = xyz[..., 2:]
     z = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
     return _to_pixels(camera, xyz[..., :2] / z)
 
 
+@shaped("camera.f: B 2, uv: B N 2, depth: B N", "camera.unproject")
 def unproject(
     camera: Camera,
     uv: Tensor,  # (B, N, 2) px
@@ -183,51 +184,53 @@ def unproject(
     """
     from kornia.geometry.camera import unproject_points  # noqa: PLC0415  (imported where it is used: 0.2 s)
 
-    check("camera.unproject", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"))
     return unproject_points(undistort(camera, uv), depth[..., None], to_matrix(camera))
 
 
+@shaped("camera.f: B 2, uv: B N 2", "camera.rays")
 def rays(camera: Camera, uv: Tensor) -> Tensor:
     """Viewing rays (B, N, 3) with z = 1 through (distorted) pixels ``uv`` (B, N, 2).
 
     By kornia's ``unproject_points`` at depth 1; a lens is undone before.
     """
-    check("camera.rays", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     check_lens(camera)
     return _rays(uv, camera.f, camera.c, camera.distortion)
-
-
-def _rays_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor | None) -> Tensor:
-    lens = uv.new_empty(0, 0) if distortion is None else distortion.contiguous()
-    ray = uv.new_empty(*uv.shape[:2], 3)
-    torch.ops.dhtorch.rays.default(uv.contiguous(), f.contiguous(), c.contiguous(), lens, ray, *NEWTON_LIMITS)
-    return ray
 
 
 #: What the kernels of this module read: pixels (B, N, 2), f and c (B, 2), distortion (B, k).
 _LENS_DTYPES = dict.fromkeys(("uv", "f", "c", "distortion"), torch.float32)
 
 
-@operator(kernel=_rays_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+@operator(
+    kernel=lambda uv, f, c, distortion: run_kernel(
+        "rays",
+        (uv, f, c, uv.new_empty(0, 0) if distortion is None else distortion),
+        uv.new_empty(*uv.shape[:2], 3),
+        *NEWTON_LIMITS,
+    ),
+    dtypes=_LENS_DTYPES,
+    any_layout=tuple(_LENS_DTYPES),
+)
 def _rays(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor | None) -> Tensor:
     """:func:`rays` of a camera's intrinsics."""
     return unproject(Camera(f, c, distortion), uv, torch.ones_like(uv[..., 0]))
 
 
+@shaped("camera.f: B 2, uv: B N 2", "camera.ray_heights")
 def ray_heights(camera: Camera, uv: Tensor) -> Tensor:
     """The y (B, N) of the :func:`rays` through ideal pixels ``uv`` (B, N, 2). Gradient: to uv and intrinsics."""
-    check("camera.ray_heights", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     return (uv[..., 1] - camera.c[:, 1:]) / camera.f[:, 1:]
 
 
+@shaped("camera.f: B 2, uv: B N 2", "camera.distort")
 def distort(camera: Camera, uv: Tensor) -> Tensor:
     """Pixels of the distorted image at ideal pixels (B, N, 2), by kornia. The inverse of :func:`undistort`."""
-    check("camera.distort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
     return _to_pixels(camera, _normalised(camera, uv))
 
 
+@shaped("camera.f: B 2, uv: B N 2", "camera.undistort")
 def undistort(camera: Camera, uv: Tensor, *, iterations: int = NEWTON_STEPS) -> Tensor:
     """Ideal pixels (B, N, 2) of pixels of the distorted image.
 
@@ -239,21 +242,19 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = NEWTON_STEPS) -> 
     distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``
     (``tests/geometry/test_camera.py``).
     """
-    check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
     check_lens(camera)
     return _undistort(uv, camera.f, camera.c, camera.distortion, iterations=iterations)
 
 
-def _undistort_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iterations: int) -> Tensor:
-    lens = f.contiguous(), c.contiguous(), distortion.contiguous()
-    ideal_uv = torch.empty_like(uv, memory_format=torch.contiguous_format)
-    torch.ops.dhtorch.undistort.default(uv.contiguous(), *lens, ideal_uv, iterations, *NEWTON_LIMITS[1:])
-    return ideal_uv
-
-
-@operator(kernel=_undistort_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+@operator(
+    kernel=lambda uv, *lens, iterations: run_kernel(
+        "undistort", (uv, *lens), uv.new_empty(uv.shape), iterations, *NEWTON_LIMITS[1:]
+    ),
+    dtypes=_LENS_DTYPES,
+    any_layout=tuple(_LENS_DTYPES),
+)
 def _undistort(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iterations: int) -> Tensor:
     """:func:`undistort` of pixels of a camera with a lens."""
     target = _planes((uv - c[:, None]) / f[:, None])
@@ -267,6 +268,7 @@ def _undistort(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor, *, iteratio
     return torch.where(converged[..., None], uv, torch.nan)
 
 
+@shaped("camera.f: B 2, depth_camera.f: B 2, uv: B N 2", "camera.depth_pixels")
 def depth_pixels(
     camera: Camera,
     hw: tuple[int, int],
@@ -279,8 +281,6 @@ def depth_pixels(
     With ``depth_camera`` the pixel follows from the viewing ray; without one the map covers the same field as the image
     of size ``hw`` and the exact scaling rule of :func:`resize` applies.
     """
-    depth_f = None if depth_camera is None else depth_camera.f
-    check("camera.depth_pixels", f=(camera.f, "B 2"), depth_f=(depth_f, "B 2"), uv=(uv, "B N 2"))
     if depth_camera is not None:
         return _to_pixels(depth_camera, _normalised(camera, undistort(camera, uv)))
     if depth_hw == hw:
@@ -288,9 +288,9 @@ def depth_pixels(
     return resize_pixels(uv, hw, depth_hw)
 
 
+@shaped("camera.f: B 2, uv_ideal: B N 2", "camera.undistort_jacobian")
 def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     """d(ideal pixel) / d(distorted pixel), (B, N, 2, 2), at ideal pixels (B, N, 2), to transport covariances."""
-    check("camera.undistort_jacobian", f=(camera.f, "B 2"), uv_ideal=(uv_ideal, "B N 2"))
     if camera.distortion is None:
         eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
         return eye.expand(*uv_ideal.shape, 2)
@@ -298,14 +298,11 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     return _undistort_jacobian(uv_ideal, camera.f, camera.c, camera.distortion)
 
 
-def _undistort_jacobian_kernel(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor) -> Tensor:
-    inputs = [x.contiguous() for x in (uv, f, c, distortion)]
-    J = uv.new_empty(*uv.shape, 2)
-    torch.ops.dhtorch.undistort_jacobian.default(*inputs, J, MIN_DETERMINANT)
-    return J
-
-
-@operator(kernel=_undistort_jacobian_kernel, dtypes=_LENS_DTYPES, any_layout=tuple(_LENS_DTYPES))
+@operator(
+    kernel=lambda uv, *lens: run_kernel("undistort_jacobian", (uv, *lens), uv.new_empty(*uv.shape, 2), MIN_DETERMINANT),
+    dtypes=_LENS_DTYPES,
+    any_layout=tuple(_LENS_DTYPES),
+)
 def _undistort_jacobian(uv: Tensor, f: Tensor, c: Tensor, distortion: Tensor) -> Tensor:
     """:func:`undistort_jacobian` of a camera with a lens."""
     f = f[:, None]

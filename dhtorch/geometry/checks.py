@@ -3,15 +3,18 @@
 *Shapes raise, values flag*: a wrong shape is an error of the caller and raises here, with the argument's name.
 """
 
-from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any
+import inspect
+from collections.abc import Callable, Sequence
+from functools import lru_cache, wraps
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 #: Largest number of kept constants of accelerators.
 MAX_CONSTANTS = 512
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 #: Patterns and shapes that passed -> sizes: an iterative fit repeats the same checks at every step.
 _cache: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
@@ -45,6 +48,36 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
             _cache.clear()
         _cache[key] = sizes
     return dict(sizes)
+
+
+def shaped(patterns: str, where: str | None = None) -> Callable[[_Function], _Function]:
+    """Decorator: a function -> the same function, which raises ValueError unless its arguments have these shapes.
+
+    Args:
+        patterns: ``"samples.xyz: B N 3, source.levels.0: B C H W"``: arguments, or tensors in them, and their patterns
+            as of :func:`check`; what is None is skipped.
+        where: name of the function for the message, where it is not its own.
+    """
+    rows = [tuple(part.strip() for part in row.split(":")) for row in patterns.split(",")]
+
+    def decorate(fn: _Function) -> _Function:
+        names = list(inspect.signature(fn).parameters)
+        paths = [(name, names.index(name.split(".")[0]), name.split("."), pattern) for name, pattern in rows]
+
+        @wraps(fn)
+        def checked(*args: Any, **kwargs: Any) -> Any:
+            tensors = {}
+            for name, position, (first, *parts), pattern in paths:
+                x = args[position] if position < len(args) else kwargs.get(first)
+                for part in parts:
+                    x = None if x is None else x[int(part)] if part.isdigit() else getattr(x, part)
+                tensors[name] = x, pattern
+            check(where or fn.__qualname__, **tensors)
+            return fn(*args, **kwargs)
+
+        return cast(_Function, checked)
+
+    return decorate
 
 
 def _bind_axes(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:

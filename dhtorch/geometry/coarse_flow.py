@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import linalg as closed_form
-from dhtorch.geometry.checks import any_possible, check, constant
+from dhtorch.geometry.checks import any_possible, constant, shaped
 from dhtorch.geometry.filters import grayscale
 from dhtorch.pytree import Record, record
 
@@ -64,12 +64,12 @@ class CoarseFlow(Record):
     linear: Tensor  # (B, 2, 2) rotation and zoom of windows, d uv_1 / d uv_0
     gain: Tensor  # (B,) contrast of image 1 over that of image 0; 1 where they hardly differ
 
+    @shaped("self.uv_1: B R C 2, uv: B N 2", "CoarseFlow.at")
     def at(self, uv: Tensor) -> Tensor:
         """Points ``uv`` (B, N, 2) px of image 0 -> predicted positions (B, N, 2) px in image 1, NaN without support.
 
         Bilinear between the centres of cells, and constant motion beyond the outermost.
         """
-        check("CoarseFlow.at", uv_1=(self.uv_1, "B R C 2"), uv=(uv, "B N 2"))
         first, last = self.uv_0[:, 0, 0], self.uv_0[:, -1, -1]
         cell_position = (uv - first[:, None]) / (last - first)[:, None]  # 0 at the first cell, 1 at the last
         displacement = (self.uv_1 - self.uv_0).permute(0, 3, 1, 2)
@@ -87,6 +87,7 @@ class CoarseFlow(Record):
 
 
 @torch.no_grad()
+@shaped("image_0: B C H W, image_1: B C h w, linear: B 2 2")
 def coarse_flow(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -113,7 +114,6 @@ def coarse_flow(
     Gradient: none; the flow is a discrete choice.
     Cost: independent of the images' size but for one pass over each; twice the flow where any pair is rotated.
     """
-    check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"), linear=(linear, "B 2 2"))
     small_0, small_1 = downscale(image_0, COARSE_SIDE_PX), downscale(image_1, COARSE_SIDE_PX)
     a, b = _quantised(small_0), _quantised(small_1)
     scale_ratio = small_1.scale / small_0.scale  # from here on similarities map small images
@@ -161,6 +161,7 @@ def apply_similarity(
     return torch.where(is_not_identity(linear)[:, None, None], transformed, uv)
 
 
+@shaped("image: B C H W, linear: B 2 2, gain: B")
 def undo_similarity(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     linear: Tensor,  # (B, 2, 2) rotation and zoom
@@ -172,7 +173,6 @@ def undo_similarity(
     Beyond the image its border repeats. Under the identity and gain 1 the grey values are unchanged, bit for bit.
     Gradient: to the image.
     """
-    check("undo_similarity", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
     picture = _grey(image)
     H, W = picture.shape[-2:]
     if any_possible(is_not_identity(linear)):
@@ -203,13 +203,13 @@ class DownscaledImage(NamedTuple):
         return uv * self.scale + self.first
 
 
+@shaped("image: B C H W")
 def downscale(image: Tensor, long: int) -> DownscaledImage:
     """Image (B, C, H, W) -> grey image with a longer side of at most ``long``; a smaller image keeps its size.
 
     In squares of sixteen pixels and more only every so many rows and columns are averaged: a hundred pixels give about
     the same mean as a thousand. Gradient: to the image.
     """
-    check("downscale", image=(image, "B C H W"))
     scale = max(1, math.ceil(max(image.shape[-2:]) / long))
     stride = max(1, scale // 8)
     side = scale // stride

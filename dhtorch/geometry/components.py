@@ -6,7 +6,7 @@ Alphabet: maps (B, h, w) bool. Pixels are connected to their four neighbours.
 import torch
 from torch import Tensor
 
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 
 
 @torch.no_grad()
@@ -31,16 +31,10 @@ def small_components(mask: Tensor, n_pixels: int, *, same: tuple[Tensor, Tensor]
     return _small(mask, right, down, n_pixels=n_pixels)
 
 
-def _small_kernel(mask: Tensor, right: Tensor, down: Tensor, *, n_pixels: int) -> Tensor:
-    small = torch.empty_like(mask, memory_format=torch.contiguous_format)
-    torch.ops.dhtorch.small_components.default(
-        mask.contiguous(), right.contiguous(), down.contiguous(), small, n_pixels
-    )
-    return small
-
-
 @operator(
-    kernel=_small_kernel,
+    kernel=lambda *masks, n_pixels: run_kernel(
+        "small_components", masks, torch.empty_like(masks[0], memory_format=torch.contiguous_format), n_pixels
+    ),
     dtypes=dict.fromkeys(("mask", "right", "down"), torch.bool),
     any_layout=("mask", "right", "down"),
 )

@@ -6,11 +6,12 @@ Alphabet: ``H`` = Σ w Jᵀ J in px² per tangent unit², ``xi`` = (rotation rad
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.least_squares import normal_equations, solve_spd
 from dhtorch.geometry.linalg import upper_triangle
 
 
+@shaped("H: B n n, sigma: B")
 def covariance_from_normal(
     H: Tensor,  # (B, n, n)
     sigma: Tensor,  # (B,) standard deviation of one residual coordinate
@@ -21,13 +22,13 @@ def covariance_from_normal(
 
     Gradient: to H and sigma. Raises ValueError for wrong shapes.
     """
-    check("covariance_from_normal", H=(H, "B n n"), sigma=(sigma, "B"))
     eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device).expand_as(H)
     inverse, ok = solve_spd(H, eye)
     inverse = 0.5 * (inverse + inverse.transpose(1, 2))
     return inverse * (sigma * sigma)[:, None, None], ok
 
 
+@shaped("x: B n, cov: B n n")
 def mahalanobis(
     x: Tensor,  # (B, n)
     cov: Tensor,  # (B, n, n)
@@ -36,11 +37,11 @@ def mahalanobis(
 
     Gradient: to x and cov, except at x = 0. Raises ValueError for wrong shapes.
     """
-    check("mahalanobis", x=(x, "B n"), cov=(cov, "B n n"))
     whitened, _ = solve_spd(cov, x[..., None])
     return (x * whitened[..., 0]).sum(-1).clamp_min(0).sqrt()
 
 
+@shaped("rows: B n 2 N, weight: B N, used: B N, group: N")
 def grouped_covariance(
     rows: Tensor,  # (B, n + 1, 2, N), of linearise: n columns of the Jacobian, then the residual
     weight: Tensor,  # (B, N) ≥ 0
@@ -55,7 +56,6 @@ def grouped_covariance(
     Gradient: to rows, weight and sigma. Raises ValueError for wrong shapes.
     Source: K.-Y. Liang, S. Zeger, "Longitudinal data analysis using generalized linear models", 1986.
     """
-    check("grouped_covariance", rows=(rows, "B n 2 N"), weight=(weight, "B N"), used=(used, "B N"), group=(group, "N"))
     H, _ = normal_equations(rows, weight)
     scores = (rows[:, :-1] * rows[:, -1:]).sum(2) * weight[:, None]  # (B, n, N)
     n_groups = int(group.max()) + 1
@@ -78,6 +78,7 @@ def chi2_quantile(p: float, degrees: int) -> float:
     return high
 
 
+@shaped("cov: B N 2 2, used: B N")
 def noise_shape(
     cov: Tensor,  # (B, N, 2, 2) px²
     used: Tensor,  # (B, N) bool
@@ -95,7 +96,6 @@ def noise_shape(
 
     Gradient: to cov, the median's choice excepted. Raises ValueError for wrong shapes.
     """
-    check("noise_shape", cov=(cov, "B N 2 2"), used=(used, "B N"))
     xx, xy, yy = upper_triangle(cov)
     valid = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
     size = torch.where(valid, 0.5 * (xx + yy), torch.ones_like(xx))
@@ -105,6 +105,7 @@ def noise_shape(
     return torch.where(valid[..., None, None], shape, eye)
 
 
+@shaped("x: B N, used: B N")
 def masked_median(
     x: Tensor,  # (B, N)
     used: Tensor,  # (B, N) bool
@@ -113,7 +114,6 @@ def masked_median(
 
     Gradient: to the entry that is the median. Raises ValueError for wrong shapes.
     """
-    check("masked_median", x=(x, "B N"), used=(used, "B N"))
     if x.shape[-1] == 0:
         return x.new_ones((*x.shape[:-1], 1))
     middle = x.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values

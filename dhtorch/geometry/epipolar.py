@@ -14,11 +14,11 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.determinism import chunk_size, pad_elementwise
 from dhtorch.geometry.linalg import quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 
 #: Limits the points of all pairs that :func:`triangulate_depth` processes at once, a count: torch does not split so few
 #: over threads.
@@ -27,6 +27,9 @@ MAX_CHUNK_TRIANGULATED = 1 << 15
 
 #: Least squared slope of a pixel by its depth, px²/m²: below it depth does not move the pixel.
 MIN_SQUARED_SLOPE = 1e-18
+
+
+_SHAPES = "uv_0: B N 2, uv_1: B N 2, camera_0.f: B 2, camera_1.f: B 2, T_1_from_0.R: B 3 3, T_1_from_0.t: B 3"
 
 
 class TwoView(NamedTuple):
@@ -40,6 +43,7 @@ class TwoView(NamedTuple):
     J_pose: Tensor  # (B, N, 2, 6) d(pixel in view 1) / d(left perturbation of T_1_from_0)
 
 
+@shaped(_SHAPES)
 def triangulate(
     uv_0: Tensor,  # (B, N, 2) ideal px
     uv_1: Tensor,  # (B, N, 2) ideal px
@@ -64,24 +68,22 @@ def triangulate(
     (``tests/geometry/test_epipolar.py``).
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
-    _check_two_views("triangulate", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     return _triangulate(uv_0, uv_1, camera_0.f, camera_0.c, camera_1.f, camera_1.c, T_1_from_0.R, T_1_from_0.t)
-
-
-def _triangulate_kernel(*tensors: Tensor) -> TwoView:
-    uv_0 = tensors[0]
-    depth, depth_1, parallax, residual = (uv_0.new_empty(uv_0.shape[:2]) for _ in range(4))
-    slope, J_pose = uv_0.new_empty(uv_0.shape), uv_0.new_empty(*uv_0.shape, 6)
-    geometry = TwoView(depth, depth_1, parallax, residual, slope, J_pose)
-    torch.ops.dhtorch.triangulate.default(*(x.contiguous() for x in tensors), *geometry)
-    return geometry
 
 
 #: What the kernel reads: pixels (B, N, 2), f and c (B, 2) px of both cameras, the pose.
 _TRIANGULATE_DTYPES = dict.fromkeys(("uv_0", "uv_1", "f_0", "c_0", "f_1", "c_1", "R", "t"), torch.float32)
 
 
-@operator(kernel=_triangulate_kernel, dtypes=_TRIANGULATE_DTYPES, any_layout=tuple(_TRIANGULATE_DTYPES))
+@operator(
+    kernel=lambda uv_0, *others: run_kernel(
+        "triangulate",
+        (uv_0, *others),
+        TwoView(*uv_0.new_empty(4, *uv_0.shape[:2]), uv_0.new_empty(uv_0.shape), uv_0.new_empty(*uv_0.shape, 6)),
+    ),
+    dtypes=_TRIANGULATE_DTYPES,
+    any_layout=tuple(_TRIANGULATE_DTYPES),
+)
 def _triangulate(*tensors: Tensor) -> TwoView:
     """:func:`triangulate` of pixels, intrinsics and a pose."""
     uv_0, uv_1, f_0, c_0, f_1, c_1, R, t = tensors
@@ -91,6 +93,7 @@ def _triangulate(*tensors: Tensor) -> TwoView:
     return _two_view(depth, torch.stack(direction, -1), uv_1, camera_1, T)
 
 
+@shaped(_SHAPES)
 def triangulate_depth(
     uv_0: Tensor,  # (B, N, 2) ideal px
     uv_1: Tensor,  # (B, N, 2) ideal px
@@ -107,7 +110,6 @@ def triangulate_depth(
 
     Gradient: as :func:`triangulate`.
     """
-    _check_two_views("triangulate_depth", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     step = max(chunk_size(MAX_CHUNK_TRIANGULATED, uv_0) // max(uv_0.shape[0], 1), 1)
     chunks = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
@@ -142,6 +144,7 @@ def _triangulated_depth(
     return near * far / (far * far).clamp_min(1e-20)
 
 
+@shaped(f"xyz_0: B N 3, {_SHAPES}")
 def describe_triangulation(
     xyz_0: Tensor,  # (B, N, 3) m in camera 0
     uv_0: Tensor,
@@ -151,28 +154,11 @@ def describe_triangulation(
     T_1_from_0: Pose,
 ) -> TwoView:
     """:class:`TwoView` of points from another triangulation; the residual is the larger of the two views."""
-    check("describe_triangulation", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"))
-    _check_two_views("describe_triangulation", uv_0, uv_1, camera_0, camera_1, T_1_from_0)
     z = xyz_0[..., 2]
     x = xyz_0 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)[..., None]
     geometry = _two_view(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
     residual_0 = _length(uv_0 - cam.project(cam.ideal(camera_0), xyz_0))
     return geometry._replace(residual_px=torch.maximum(geometry.residual_px, residual_0))
-
-
-def _check_two_views(
-    where: str, uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose
-) -> None:
-    """Raise a ValueError unless pixels (B, N, 2) of both views, cameras and pose have the same B and N."""
-    check(
-        where,
-        uv_0=(uv_0, "B N 2"),
-        uv_1=(uv_1, "B N 2"),
-        f0=(camera_0.f, "B 2"),
-        f1=(camera_1.f, "B 2"),
-        R=(T_1_from_0.R, "B 3 3"),
-        t=(T_1_from_0.t, "B 3"),
-    )
 
 
 def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:
@@ -194,6 +180,7 @@ def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, 
     )
 
 
+@shaped("camera.f: B 2, xyz: B N 3")
 def point_jacobians(
     camera: Camera,
     xyz: Tensor,  # (B, N, 3) m in that camera
@@ -203,7 +190,6 @@ def point_jacobians(
     |z| is kept away from zero, where kornia's ``dx_project_points_z1`` has no finite gradient. Checked against
     ``torch.func.jacrev`` (``tests/geometry/test_epipolar.py``).
     """
-    check("point_jacobians", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     x, y, z = xyz.unbind(-1)
     inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
     zero = torch.zeros_like(z)
@@ -228,17 +214,16 @@ def depth_variance(
     return _depth_variance(geometry.slope, geometry.J_pose, cov_uv_1, cov_pose)
 
 
-def _depth_variance_kernel(slope: Tensor, J_pose: Tensor, cov_uv_1: Tensor, cov_pose: Tensor) -> tuple[Tensor, Tensor]:
-    own, shared = (slope.new_empty(slope.shape[:2]) for _ in range(2))
-    inputs = (x.contiguous() for x in (slope, J_pose, cov_uv_1, cov_pose))
-    torch.ops.dhtorch.depth_variance.default(*inputs, own, shared, MIN_SQUARED_SLOPE)
-    return own, shared
-
-
 _VARIANCE_DTYPES = dict.fromkeys(("slope", "J_pose", "cov_uv_1", "cov_pose"), torch.float32)
 
 
-@operator(kernel=_depth_variance_kernel, dtypes=_VARIANCE_DTYPES, any_layout=tuple(_VARIANCE_DTYPES))
+@operator(
+    kernel=lambda slope, *others: run_kernel(
+        "depth_variance", (slope, *others), slope.new_empty(2, *slope.shape[:2]).unbind(), MIN_SQUARED_SLOPE
+    ),
+    dtypes=_VARIANCE_DTYPES,
+    any_layout=tuple(_VARIANCE_DTYPES),
+)
 def _depth_variance(slope: Tensor, J_pose: Tensor, cov_uv_1: Tensor, cov_pose: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`depth_variance` of fields of a :class:`TwoView`."""
     slope2 = (slope * slope).sum(-1)

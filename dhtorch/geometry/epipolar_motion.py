@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import robust_loss
 from dhtorch.geometry.reprojection_problem import MEDIAN_1D
@@ -26,6 +26,7 @@ class EpipolarMotion(NamedTuple):
     inlier: Tensor  # (B, N) bool
 
 
+@shaped("x: B 3 N, y: B 3 N, used: B N, R: B 3 3")
 def fit_epipolar_motion(
     x: Tensor,  # (B, 3, N) rays of view 0, any length
     y: Tensor,  # (B, 3, N) rays of view 1, any length
@@ -44,7 +45,6 @@ def fit_epipolar_motion(
 
     Gradient: none.
     """
-    check("fit_epipolar_motion", x=(x, "B 3 N"), y=(y, "B 3 N"), used=(used, "B N"), R=(R, "B 3 3"))
     x, y = F.normalize(x, dim=1), F.normalize(y, dim=1)
     weight = used.to(x.dtype)
     b = R.mT @ y

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, shaped
 
 
 def grayscale(image: Tensor) -> Tensor:
@@ -62,6 +62,7 @@ def gaussian_taps(sigma_px: float, derivative: bool = False) -> list[float]:
     return [v / gain for v in slope]
 
 
+@shaped("x: B C H W")
 def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tensor:
     """Images (B, C, H, W) -> blurred by a Gaussian up to four sigma, by kornia; unchanged for sigma 0.
 
@@ -74,7 +75,6 @@ def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) ->
     """
     from kornia.filters import gaussian_blur2d  # noqa: PLC0415  (imported where it is used: 0.2 s)
 
-    check("gaussian_blur", x=(x, "B C H W"))
     size = len(gaussian_taps(sigma_px)) if reach_px is None else 2 * reach_px + 1
     if size == 1 or len(x) == 0:
         return x

@@ -8,7 +8,7 @@ too small, within the range of a sensor that has no return there.
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check, constant
+from dhtorch.geometry.checks import constant, shaped
 from dhtorch.geometry.covariance import masked_median
 
 #: Approximate number of samples in a cell of the image.
@@ -18,6 +18,7 @@ SAMPLES_PER_CELL = 10
 MIN_FREE_SPACE_ANSWERS = 10
 
 
+@shaped("uv: B N 2, sensed: B N, pose_returns: B N, candidates: B N, depth: B N, sigma: B N")
 def free_space_violations(
     uv: Tensor,  # (B, N, 2) px
     sensed: Tensor,  # (B, N) m, 0 = no return
@@ -46,14 +47,6 @@ def free_space_violations(
 
     Gradient: none.
     """
-    check(
-        "free_space_violations",
-        uv=(uv, "B N 2"),
-        sensed=(sensed, "B N"),
-        pose_returns=(pose_returns, "B N"),
-        candidates=(candidates, "B N"),
-    )
-    check("free_space_violations", uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
     has_return = sensed > 0
     pose_returns = pose_returns & has_return
     return_ratio = _return_ratio(uv, has_return)

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
-from dhtorch.geometry.checks import all_known, check
+from dhtorch.geometry.checks import all_known, check, shaped
 from dhtorch.geometry.linalg import small_matmul, solve_cholesky
 from dhtorch.geometry.se3 import Pose
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 
 #: Limits the depth of a point in front of a camera from below, m.
 MIN_DEPTH = 1e-6
@@ -45,6 +45,7 @@ class NormalEquations(NamedTuple):
     g: Tensor  # (B, n)
 
 
+@shaped("T.R: B 3 3, f: B 2, c: B 2, xyz: B 3 N, uv: B 2 N")
 def linearise(
     T: Pose,
     f: Tensor,  # (B, 2) px
@@ -64,7 +65,6 @@ def linearise(
     Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against ``torch.func.jacrev``
     (``tests/geometry/test_least_squares.py``).
     """
-    check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     plane, w, z = _project_to_plane(T, xyz)
     f = f[..., None]
     minus, square = -plane, plane * plane
@@ -79,6 +79,7 @@ def linearise(
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
 
 
+@shaped("T.R: B 3 3, f: B 2, c: B 2, xyz: B 3 N, uv: B 2 N")
 def reprojection_residuals(
     T: Pose,
     f: Tensor,  # (B, 2) px
@@ -90,7 +91,6 @@ def reprojection_residuals(
 
     Gradient: to pose, f, c, xyz and uv. Raises ValueError for wrong shapes.
     """
-    check("reprojection_residuals", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     plane, _, z = _project_to_plane(T, xyz)
     f = f[..., None]
     return (plane - (uv - c[..., None]) / f) * f, z
@@ -189,6 +189,7 @@ def _in_blocks(x: Tensor, block: int) -> tuple[Tensor, ...]:
     return x.unflatten(-1, (-1, block)).permute(3, 0, 1, 2, 4).flatten(3).unbind(0)  # one copy for all
 
 
+@shaped("H: B n n, b: B n k")
 def solve_spd(
     H: Tensor,  # (B, n, n) symmetric
     b: Tensor,  # (B, n, k)
@@ -206,19 +207,17 @@ def solve_spd(
 
     Gradient: exact to H and b, first order only; zero where not ok.
     """
-    check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))
     x, ok = _solve(H.double(), b.double())
     return x.to(b.dtype), ok
 
 
-def _solve_kernel(H: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    x = torch.empty_like(b, memory_format=torch.contiguous_format)
-    ok = torch.empty_like(H[:, 0, 0], dtype=torch.bool, memory_format=torch.contiguous_format)
-    torch.ops.dhtorch.solve_spd.default(H.contiguous(), b.contiguous(), x, ok, MIN_PIVOT)
-    return x, ok
-
-
-@operator(kernel=_solve_kernel, dtypes={"H": torch.float64, "b": torch.float64}, any_layout=("H", "b"))
+@operator(
+    kernel=lambda H, b: run_kernel(
+        "solve_spd", (H, b), (b.new_empty(b.shape), H.new_empty(len(H), dtype=torch.bool)), MIN_PIVOT
+    ),
+    dtypes={"H": torch.float64, "b": torch.float64},
+    any_layout=("H", "b"),
+)
 def _solve(H: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`solve_spd` in float64."""
     n = H.shape[-1]
@@ -275,28 +274,17 @@ def has_graph(x: Tensor) -> bool:
     return x.requires_grad or unpack_dual(x).tangent is not None
 
 
-def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
-    """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
-
-    From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
-    residuals, which :func:`implicit_step` includes. The step moves the pose by Cayley's map, a rotation that agrees
-    with exp to second order and needs no transcendental function.
-
-    Gradient: to T, H and g. Raises ValueError for wrong shapes.
-    """
-    xi, ok = solve_spd(H, -g[..., None])
-    return move_pose(T, xi[..., 0]), ok
-
-
+@shaped("T.R: B 3 3, xi: B 6")
 def move_pose(
     T: Pose,
     xi: Tensor,  # (B, 6)
 ) -> Pose:
     """The pose displaced by a tangent vector, to second order in the rotation and without transcendental functions.
 
+    The rotation is Cayley's map, which agrees with exp to second order.
+
     Gradient: to T and xi. Raises ValueError for wrong shapes.
     """
-    check("move_pose", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
     half, t = (0.5 * xi).split(3, 1)
     half = half[..., None]
     M = torch.cat((T.R, T.t[..., None]), -1)
@@ -306,49 +294,41 @@ def move_pose(
     return Pose(M[..., :3], M[..., 3] + (t + t))
 
 
-def trial_pose_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
-    """:func:`gauss_newton_step` in fewer operations, for proposals whose cost is compared afterwards.
-
-    The system is solved in float64 by elimination and not refined. Where it has no solution, or NaN, the pose is NaN,
-    and its cost is below no other.
-
-    Gradient: none. Raises ValueError for wrong shapes.
-    """
-    check("trial_pose_step", H=(H, "B 6 6"), g=(g, "B 6"))
-    with torch.no_grad():
-        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        return move_pose(T, xi.to(g.dtype)), info == 0
-
-
 def minimise(
     evaluate: Callable[[S], NormalEquations],
     T: S,
     steps: int,
     *,
+    move: Callable[[S, Tensor], S],
     cost: Callable[[S], Tensor] | None = None,
     damping: float = INITIAL_DAMPING,
-    step: Callable[[Any, Tensor, Tensor], tuple[Any, Tensor]] = gauss_newton_step,
 ) -> tuple[S, Tensor]:
     """Levenberg–Marquardt with a fixed number of steps; each batch element accepts or rejects its own.
 
     Args:
         evaluate: cost and normal equations at a pose; masks and weights may be recomputed there.
-        T: start; a pose, or another record of unknowns that ``step`` can move.
+        T: start; a pose, or another record of unknowns.
         steps: number of proposals.
+        move: ``(T, xi) -> T``, unknowns displaced by a tangent vector (B, n), such as :func:`move_pose`.
         cost: the cost (B,) of ``evaluate`` alone, for the last proposal, after which no step follows.
         damping: initial factor of the diagonal; ×0.1 after an accepted step, ×10 after a rejected one.
-        step: ``(T, H, g) -> (T, ok)``, the Gauss–Newton step.
+
+    The damped system is solved in float64 by elimination and not refined: proposals are compared by their costs. Where
+    it has no solution, or NaN, the proposal is NaN, and its cost is below no other.
 
     Returns:
         The best pose evaluated and its cost (B,); the cost never rises above the start's.
 
-    Gradient: not intended; take :func:`gauss_newton_step` from the detached result.
+    Gradient: not intended; take :func:`implicit_step` from the detached result.
     """
     best = evaluate(T)
     eye = torch.eye(best.H.shape[-1], dtype=best.H.dtype, device=best.H.device)
     factor = torch.full_like(best.cost, damping)
     for k in range(steps):
-        proposal, ok = step(T, best.H * (1 + factor[:, None, None] * eye), best.g)
+        with torch.no_grad():
+            H = best.H * (1 + factor[:, None, None] * eye)
+            xi, info = torch.linalg.solve_ex(H.double(), -best.g.double())
+            proposal, ok = move(T, xi.to(best.g.dtype)), info == 0
         if k == steps - 1:
             last_cost = evaluate(proposal).cost if cost is None else cost(proposal)
             accepted = ok & (last_cost < best.cost)

@@ -29,6 +29,7 @@ from dhtorch.geometry.reprojection_problem import (
     estimate_noise_variance,
     linearise_tracks,
     minimise_tracks,
+    noise_factors,
     sandwich_sums,
     shutter_prior,
     squared_residuals,
@@ -272,8 +273,8 @@ def _sandwich_parts(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     """What the sandwich and the jackknife of :func:`pose_covariance` add up: whether tracks are in front (B, N),
     whitened rows (B, 10, 2, N), robust weight of each track (B, N), and its weights in bread and meat."""
     linear = linearise_tracks(problem, solution.at)
-    rows = whitened_residuals(problem, linear, solution.noise).double()
-    square = squared_residuals(problem, linear, solution.noise)
+    factors = noise_factors(linear.fixed, solution.noise)
+    rows, square = whitened_residuals(linear, factors).double(), squared_residuals(linear, factors)
     _, weight = robust_loss(square, o.kernel, o.bend)
     bread, meat = torch.zeros_like(square), torch.zeros_like(square)
     near_weight = torch.ones_like(solution.far_weight)

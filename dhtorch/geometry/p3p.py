@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.linalg import cofactor_planes
 
 #: Limits the flatness of a triple: height over longest side below which it is collinear, without unit.
@@ -21,6 +21,7 @@ MIN_HEIGHT_RATIO = 1e-3
 MAX_RAY_COSINE = 1 - 1e-12
 
 
+@shaped("rays: * 3 3, xyz: * 3 3")
 def p3p(
     rays: Tensor,  # (*, 3, 3) point, coordinate: viewing rays of any length
     xyz: Tensor,  # (*, 3, 3) point, coordinate: the points, m
@@ -62,7 +63,6 @@ def p3p(
         >>> int(right.sum()), bool(torch.allclose(R[right], torch.eye(3), atol=1e-4))
         (1, True)
     """
-    check("p3p", rays=(rays, "* 3 3"), xyz=(xyz, "* 3 3"))
     if rays.shape != xyz.shape:
         raise ValueError(f"p3p: rays have shape {tuple(rays.shape)}, xyz {tuple(xyz.shape)}, expected equal shapes")
     R, t, valid = p3p_of_planes(*(x.movedim((-2, -1), (0, 1)) for x in (rays, xyz)))

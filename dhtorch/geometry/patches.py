@@ -14,7 +14,7 @@ from torch import Tensor
 from dhtorch.geometry.checks import check, constant, is_transformed
 from dhtorch.geometry.determinism import ELEMENTWISE_LANES, chunk_size
 from dhtorch.ops.constants import LUMA_THOUSANDTHS, MAX_KERNEL_WINDOW_PX
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 
 #: Luma weights of red, green and blue, ratios; those of ``cv2.cvtColor`` (``tests/geometry/test_patches.py``).
 #: Source: ITU-R BT.601.
@@ -82,17 +82,17 @@ def fits_window_kernel(_image: Tensor, _pixel: Tensor, *, size: int) -> bool:
     return size <= MAX_KERNEL_WINDOW_PX
 
 
-def window_arguments(image: Tensor, pixel: Tensor, size: int) -> tuple[Tensor, Tensor, tuple[int, ...]]:
-    """Kernel arguments of windows (B, N): the images as one flat tensor, the pixels, and the strides of image, channel,
-    row and column, channels, height, width and window size.
+def run_window_kernel(name: str, windows: tuple[Tensor, Tensor, int], output: Tensor, *numbers: Any) -> Tensor:
+    """Run a kernel on the windows of a size around pixels of images -> its output.
 
     Raises:
         ValueError: as :func:`reduce_patches`.
     """
+    image, pixel, size = windows
     sizes = check("reduce_patches", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     _check_patch_size("reduce_patches", size, sizes["H"], sizes["W"])
     flat, steps = flatten_images(image)
-    return flat, pixel, (*steps, *(sizes[k] for k in "CHW"), size)
+    return run_kernel(name, (flat, pixel), output, *steps, *(sizes[k] for k in "CHW"), size, *numbers)
 
 
 def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
@@ -271,14 +271,11 @@ def nearest_pixel_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Ten
     return torch.add(x, y, alpha=hw[1]).long(), (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
-def _containing_pixels_kernel(uv: Tensor) -> Tensor:
-    uv = uv.contiguous()  # samples shared by a batch are an expanded view
-    pixel = torch.empty_like(uv, dtype=torch.int32)
-    torch.ops.dhtorch.containing_pixels.default(uv, pixel)
-    return pixel
-
-
-@operator(kernel=_containing_pixels_kernel, dtypes={"uv": torch.float32}, any_layout=("uv",))
+@operator(
+    kernel=lambda uv: run_kernel("containing_pixels", [uv], uv.new_empty(uv.shape, dtype=torch.int32)),
+    dtypes={"uv": torch.float32},
+    any_layout=("uv",),
+)
 def containing_pixels(uv: Tensor) -> Tensor:
     """Points ``uv`` -> the pixels that contain them, int32; a pixel outside any image for non-finite points."""
     return round_half_up(uv.nan_to_num(-1.0)).int()

@@ -22,11 +22,11 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, all_known, check, constant
+from dhtorch.geometry.checks import all_finite, all_known, check, constant, shaped
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.windows import window_sum
 from dhtorch.ops.constants import FIT_RADIUS_PX
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 from dhtorch.pytree import Record, record
 
 #: Offsets (down, right) of the signs of a census, px: a checkerboard of 9 x 7 pixels without its middle pixel. 31 signs
@@ -141,10 +141,10 @@ def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)], 1).flatten(2).mT
 
 
+@shaped("image: B 1 h w, camera.f: B 2")
 def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
     """Grey image (B, 1, h, w) and camera -> reference view. Gradient: to the image and, through the rays, to the
     camera."""
-    check("make_reference_view", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
     has_ray = all_finite(ray, -1) if camera.distortion is not None else _has_focal_length(camera, ray)
     if not all_known(has_ray):
@@ -159,25 +159,13 @@ def _has_focal_length(camera: Camera, ray: Tensor) -> Tensor:
     return is_finite.expand(ray.shape[:-1]).contiguous()
 
 
+@shaped("ray: B N 3, q: B N, view.T_1_from_0.t: B 3")
 def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Rays (B, N, 3) of view 0 and inverse depths q (B, N) -> pixels (B, N, 2) of view 1, and whether the points lie in
     front of it (B, N). Gradient: to everything."""
-    check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     T, camera = view.T_1_from_0, view.camera
     cam.check_lens(camera)
     return _project(ray, q, T.R, T.t, view.shutter_rate, *(camera.f, camera.c, camera.distortion))
-
-
-def _transform_points(
-    ray: Tensor, q: Tensor, R: Tensor, t: Tensor, shutter_rate: Tensor | None
-) -> tuple[list[Tensor], Tensor]:
-    """Points R r + q t of view 1, three planes (B, N), 1 for points behind it; and whether they are in front (B, N)."""
-    x, y, z = (component + q * t[:, None] for component, t in zip(rotate_rays(R, ray), t.unbind(-1), strict=True))
-    if shutter_rate is not None:
-        p, o, s = (shutter_rate[:, k, None] * ray[..., 1] for k in range(3))
-        x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
-    in_front = z > MIN_DEPTH_RATIO
-    return [torch.where(in_front, component, 1.0) for component in (x, y, z)], in_front
 
 
 def _project_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
@@ -199,7 +187,12 @@ def _project_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
 def _project(*tensors: Any) -> tuple[Tensor, Tensor]:
     """:func:`project_inverse_depth` under a motion, into a camera's intrinsics."""
     ray, q, R, t, shutter_rate, f, c, distortion = tensors
-    (x, y, z), in_front = _transform_points(ray, q, R, t, shutter_rate)
+    x, y, z = (component + q * t[:, None] for component, t in zip(rotate_rays(R, ray), t.unbind(-1), strict=True))
+    if shutter_rate is not None:
+        p, o, s = (shutter_rate[:, k, None] * ray[..., 1] for k in range(3))
+        x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
+    in_front = z > MIN_DEPTH_RATIO
+    x, y, z = (torch.where(in_front, component, 1.0) for component in (x, y, z))
     if distortion is not None:
         return cam.project(Camera(f, c, distortion), torch.stack((x, y, z), -1)), in_front
     axes = [component / z * f[:, k, None] + c[:, k, None] for k, component in enumerate((x, y))]
@@ -214,15 +207,15 @@ def rotate_rays(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return right, down, forward
 
 
-def _sample_bilinear_kernel(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    axes = uv.mT.contiguous()
-    values = image.new_empty(*image.shape[:2], uv.shape[1])
-    inside = torch.empty_like(axes[:, 0], dtype=torch.bool)
-    torch.ops.dhtorch.sample_bilinear.default(image, axes, values, inside)
-    return values, inside
-
-
-@operator(kernel=_sample_bilinear_kernel, dtypes={"image": torch.float32, "uv": torch.float32}, any_layout=("uv",))
+@operator(
+    kernel=lambda image, uv: run_kernel(
+        "sample_bilinear",
+        (image, uv.mT),
+        (image.new_empty(*image.shape[:2], uv.shape[1]), uv.new_empty(uv.shape[:2], dtype=torch.bool)),
+    ),
+    dtypes={"image": torch.float32, "uv": torch.float32},
+    any_layout=("uv",),
+)
 def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Images (B, C, H, W) and pixels (B, N, 2) -> bilinear values (B, C, N), and which pixels lie inside (B, N).
 
@@ -243,17 +236,19 @@ def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
     return EpipolarWarp(base.ideal_uv, s[:, :2] * f + c * s[:, 2:], s[:, 2])
 
 
-def _census_kernel(grey: Tensor) -> Tensor:
-    check("census_transform", grey=(grey, "B 1 h w"))
-    code = torch.empty_like(grey[:, 0], dtype=torch.int32)
-    torch.ops.dhtorch.census_transform.default(grey[:, 0], torch.tensor(CENSUS_OFFSETS), code)
-    return code
-
-
-@operator(kernel=_census_kernel, dtypes={"grey": torch.float32})
+@operator(
+    kernel=shaped("grey: B 1 h w", "census_transform")(
+        lambda grey: run_kernel(
+            "census_transform",
+            (grey[:, 0], torch.tensor(CENSUS_OFFSETS)),
+            torch.empty_like(grey[:, 0], dtype=torch.int32),
+        )
+    ),
+    dtypes={"grey": torch.float32},
+)
+@shaped("grey: B 1 h w")
 def census_transform(grey: Tensor) -> Tensor:
     """Images (B, 1, h, w) -> codes (B, h, w) int32: of each of 31 neighbours whether it is darker than the middle."""
-    check("census_transform", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
@@ -263,15 +258,6 @@ def census_transform(grey: Tensor) -> Tensor:
             byte += (padded[:, 3 + i : 3 + i + h, 4 + j : 4 + j + w] < middle).to(torch.uint8).mul_(1 << k)
         code += byte.to(torch.int32) << first
     return code
-
-
-def _count_set_bits(x: Tensor) -> Tensor:
-    """Number of bits that are set among the lower 31 of int32 (…)."""
-    x = x - x.bitwise_right_shift(1).bitwise_and_(0x55555555)
-    high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
-    x = x.bitwise_and_(0x33333333).add_(high)
-    x = x.add_(x.bitwise_right_shift(4)).bitwise_and_(0x0F0F0F0F)
-    return x.mul_(0x01010101).bitwise_right_shift_(24)  # the highest byte holds the sum of all bytes
 
 
 @torch.no_grad()
@@ -289,8 +275,8 @@ def add_census_costs(
     At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C comes from :func:`new_cost_volume`, or has its planes first
     in memory. Memory: images of view 0's size, whatever D. Gradient: none.
     """
-    margin = max(base.hw) // BORDER_DIVISOR
-    hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
+    height, width, margin = _padded_size(base.hw)
+    hw = height, width
     # The source view in the orientation of the reference view, on its pixel grid plus the margin.
     ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
     uv, in_front = project_inverse_depth(view, ray, ray.new_zeros(ray.shape[:2]))
@@ -325,17 +311,23 @@ def _add_costs(*tensors: Any, layout: tuple[tuple[int, int], int], fresh: bool) 
         C.zero_()
     for k in range(q.shape[1]):
         code = code_1.gather(1, warp.cell(q[:, k, None], *layout))
-        count = _count_set_bits(code ^ code_0)
+        x = code ^ code_0  # the number of bits that are set among its lower 31
+        x = x - x.bitwise_right_shift(1).bitwise_and_(0x55555555)
+        high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
+        x = x.bitwise_and_(0x33333333).add_(high)
+        x = x.add_(x.bitwise_right_shift(4)).bitwise_and_(0x0F0F0F0F)
+        # the highest byte holds the sum of all bytes
+        count = x.mul_(0x01010101).bitwise_right_shift_(24)
         unseen = code.bitwise_right_shift(31)  # all bits or none; boolean masks take three times as long
         cost = count.add_(unseen.bitwise_and_(UNSEEN_COST - count))
         C[..., k] += cost.to(torch.uint8).unflatten(-1, C.shape[1:3])
 
 
-def _new_cost_volume_kernel(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
-    return torch.empty(len(q), *hw, q.shape[1], dtype=torch.uint8).movedim(-1, 1)  # the kernel runs pixel by pixel
-
-
-@operator(kernel=_new_cost_volume_kernel, dtypes={"q": torch.float32})
+# The kernel fills the volume pixel by pixel.
+@operator(
+    kernel=lambda q, *, hw: torch.empty(len(q), *hw, q.shape[1], dtype=torch.uint8).movedim(-1, 1),
+    dtypes={"q": torch.float32},
+)
 def new_cost_volume(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
     """Planes q (B, D) and image size -> uninitialised costs (B, D, h, w) uint8, in the memory layout that
     :func:`add_census_costs` fills fastest. Gradient: none."""
@@ -411,9 +403,9 @@ class BestPlane(NamedTuple):
     cost: Tensor  # (B, h, w) of that plane
 
 
+@shaped("S: B h w D")
 def best_plane(S: Tensor) -> BestPlane:
     """Aggregated costs S (B, h, w, D) -> plane of least cost, the first of equals, and parabolic sub-plane shift."""
-    check("best_plane", S=(S, "B h w D"))
     return BestPlane(
         *(torch.cat(part, 1) for part in zip(*map(_argmin_subplane, S.split(ROWS_PER_BLOCK, 1)), strict=True))
     )
@@ -591,31 +583,25 @@ def occlusion_mask(go: EpipolarWarp, q: Tensor, tolerance: Tensor) -> Tensor:
     return _occlusion_mask(*go, q.flatten(1), tolerance, hw=(q.shape[1], q.shape[2])).unflatten(1, q.shape[1:])
 
 
-def _padded_size(hw: tuple[int, int]) -> tuple[tuple[int, int], int]:
+def _padded_size(hw: tuple[int, int]) -> tuple[int, int, int]:
     """Image size -> height and width with a border for points outside the image; width of the border, px."""
     border = max(hw) // BORDER_DIVISOR
-    return (hw[0] + 2 * border, hw[1] + 2 * border), border
-
-
-def _occlusion_mask_kernel(
-    a: Tensor, b: Tensor, c: Tensor, q: Tensor, tolerance: Tensor, *, hw: tuple[int, int]
-) -> Tensor:
-    size, border = _padded_size(hw)
-    occluded = torch.empty_like(q, dtype=torch.bool)
-    warp = a, b[..., 0].contiguous(), c[:, 0].contiguous()
-    limits = MIN_DEPTH_RATIO, BEHIND_SCALE
-    torch.ops.dhtorch.occlusion_mask.default(*warp, q, tolerance, occluded, *size, border, *limits)
-    return occluded
+    return hw[0] + 2 * border, hw[1] + 2 * border, border
 
 
 @operator(
-    kernel=_occlusion_mask_kernel,
+    kernel=lambda a, b, c, q, tolerance, *, hw: run_kernel(
+        "occlusion_mask",
+        (a, b[..., 0], c[:, 0], q, tolerance),
+        torch.empty_like(q, dtype=torch.bool),
+        *(*_padded_size(hw), MIN_DEPTH_RATIO, BEHIND_SCALE),
+    ),
     dtypes=dict.fromkeys(("a", "b", "c", "q", "tolerance"), torch.float32),
     any_layout=("b", "c"),
 )
 def _occlusion_mask(a: Tensor, b: Tensor, c: Tensor, q: Tensor, tolerance: Tensor, *, hw: tuple[int, int]) -> Tensor:
     """:func:`occlusion_mask` (B, N) of a map (B, N) of size ``hw`` and the fields of :class:`EpipolarWarp`."""
-    size, border = _padded_size(hw)
-    index = EpipolarWarp(a, b, c).cell(q, size, border)
-    nearest = q.new_full((len(q), size[0] * size[1]), -1.0).scatter_reduce(1, index, q, "amax")
+    height, width, border = _padded_size(hw)
+    index = EpipolarWarp(a, b, c).cell(q, (height, width), border)
+    nearest = q.new_full((len(q), height * width), -1.0).scatter_reduce(1, index, q, "amax")
     return nearest.gather(1, index) > q + tolerance[:, None]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.se3 import Pose
 
 #: Camera axes in which poses are written, as rows of M.
@@ -43,6 +43,7 @@ CONVENTIONS = tuple(", ".join(part for part in parts if part) for parts in _COMB
 STATED_AXES = {"cv": CAMERA_AXES[""], "gl": CAMERA_AXES["OpenGL axes (x right, y up, z backward)"]}
 
 
+@shaped("T.R: B 3 3, T.t: B 3, other_way.R: B 3 3, other_way.t: B 3")
 def pose_hypotheses(
     T: Pose,  # (B,), as stated
     other_way: Pose,  # (B,), with every pose that it is computed from inverted
@@ -54,9 +55,6 @@ def pose_hypotheses(
 
     Gradient: to both.
     """
-    check(
-        "pose_hypotheses", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3")
-    )
     hypotheses = []
     for axes, direction, unit in _COMBINATIONS:
         motion = motion_from_axes(other_way if direction else T, CAMERA_AXES[axes])
@@ -75,6 +73,7 @@ def pose_from_axes(T_world_from_cam: Pose, axes: tuple[tuple[int, int, int], ...
     return T_world_from_cam.replace(R=T_world_from_cam.R @ _axes_matrix(axes, T_world_from_cam.R))
 
 
+@shaped("T_world_from_1.R: B 3 3, cov_0: B 6 6, cov_1: B 6 6")
 def relative_covariance(
     T_world_from_1: Pose,  # (B,)
     cov_0: Tensor,  # (B, 6, 6) of the left perturbation of T_world_from_0
@@ -84,7 +83,6 @@ def relative_covariance(
 
     Gradient: to all. Raises ValueError for wrong shapes.
     """
-    check("relative_covariance", R=(T_world_from_1.R, "B 3 3"), cov_0=(cov_0, "B 6 6"), cov_1=(cov_1, "B 6 6"))
     A = se3.adjoint(se3.invert(T_world_from_1))
     return A @ (cov_0 + cov_1) @ A.mT
 

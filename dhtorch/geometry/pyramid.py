@@ -159,7 +159,7 @@ def build_pyramid(
     Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and sampled at even pixels; gradients
     are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
     zero (a mirrored gradient would keep a window inside the border). As in ``cv2.buildOpticalFlowPyramid``
-    (``tests/geometry/test_pyramid_levels.py``), a level that would be no larger than the window is left out.
+    (``tests/geometry/test_pyramid.py``), a level that would be no larger than the window is left out.
 
     Args:
         gradients: without them the pyramid takes a third of the memory and can only be the target of a search.

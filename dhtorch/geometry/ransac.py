@@ -7,7 +7,7 @@ order, ``count`` (B,) of them. Points are planes (B, 3, M) and (B, 2, M). Nothin
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, shaped
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p_of_planes
@@ -56,6 +56,7 @@ def evenly_spaced_slots(count: Tensor, size: int) -> Tensor:
     return torch.minimum(slot * count.clamp_min(size) // size, (count - 1).clamp_min(0))
 
 
+@shaped("draws: B H 3, count: B")
 def distinct_triples(
     draws: Tensor,  # (B, H, 3) uniform in [0, 1)
     count: Tensor,  # (B,) int64
@@ -68,7 +69,6 @@ def distinct_triples(
     Raises:
         ValueError: wrong shapes.
     """
-    check("distinct_triples", draws=(draws, "B H 3"), count=(count, "B"))
     left = (count[:, None, None] - torch.arange(3, device=count.device)).clamp_min(1)
     first, second, third = torch.minimum((draws * left).long(), left - 1).unbind(-1)
     second = torch.where(second >= first, second + 1, second)
@@ -157,6 +157,7 @@ def search_hypotheses(
     return Pose(poses[..., :3], poses[..., 3]), cost
 
 
+@shaped("xyz: B 3 M, used: B M")
 def is_collinear(
     xyz: Tensor,  # (B, 3, M) m
     used: Tensor,  # (B, M) bool
@@ -169,7 +170,6 @@ def is_collinear(
     Raises:
         ValueError: wrong shapes.
     """
-    check("is_collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
     used = (used & (reach <= MAX_DISTANCE_RATIO * masked_median(reach, used)))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()

@@ -17,13 +17,13 @@ shutter bundle adjustment", 2012.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import any_possible, check, constant
+from dhtorch.geometry.checks import any_possible, constant, shaped
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.determinism import SUM_LANES
 from dhtorch.geometry.least_squares import (
@@ -34,11 +34,10 @@ from dhtorch.geometry.least_squares import (
     move_pose,
     normal_equations,
     robust_loss,
-    solve_spd,
 )
 from dhtorch.geometry.linalg import rotate_planes
 from dhtorch.geometry.se3 import Pose, hat
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 from dhtorch.pytree import Record, record
 
 #: Limits how much closer than the nearest near return a far track may be: factor on inverse depth, without unit.
@@ -87,39 +86,12 @@ class Unknowns(NamedTuple):
 def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
     """The unknowns displaced by xi (B, 9): tangent vector of the pose, shutter rate; (B, 6) without a shutter rate.
 
-    Gradient: to both. Raises ValueError for wrong shapes.
+    Gradient: to both.
     """
-    check(
-        "retract_unknowns", shutter_rate=(at.shutter_rate, "B 3"), xi=(xi, "B 6" if at.shutter_rate is None else "B 9")
-    )
     return Unknowns(move_pose(at.T, xi[:, :6]), None if at.shutter_rate is None else at.shutter_rate + xi[:, 6:])
 
 
-def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
-    """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
-
-    Without a shutter rate H is (B, 6, 6) and g (B, 6).
-
-    Gradient: to all three. Raises ValueError for wrong shapes.
-    """
-    check("unknowns_step", shutter_rate=(at.shutter_rate, "B 3"), H=(H, "B n n"), g=(g, "B n"))
-    xi, ok = solve_spd(H, -g[..., None])
-    return retract_unknowns(at, xi[..., 0]), ok
-
-
-def trial_unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
-    """:func:`unknowns_step` in fewer operations, for proposals whose cost is compared afterwards.
-
-    See ``least_squares.trial_pose_step``.
-
-    Gradient: none. Raises ValueError for wrong shapes.
-    """
-    check("trial_unknowns_step", shutter_rate=(at.shutter_rate, "B 3"), H=(H, "B n n"), g=(g, "B n"))
-    with torch.no_grad():
-        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        return retract_unknowns(at, xi.to(g.dtype)), info == 0
-
-
+@shaped("uv: B 2 N, f: B 2, c: B 2, y: B N, shutter_rate: B 3")
 def undo_rolling_shutter(
     uv: Tensor,  # (B, 2, N) ideal px of camera 1, planes
     f: Tensor,  # (B, 2) px
@@ -131,14 +103,6 @@ def undo_rolling_shutter(
 
     Gradient: to all. Raises ValueError for wrong shapes.
     """
-    check(
-        "undo_rolling_shutter",
-        uv=(uv, "B 2 N"),
-        f=(f, "B 2"),
-        c=(c, "B 2"),
-        y=(y, "B N"),
-        shutter_rate=(shutter_rate, "B 3"),
-    )
     f, c = f[..., None], c[..., None]
     return _straighten((uv - c) / f, y, shutter_rate) * f + c
 
@@ -184,6 +148,7 @@ class LinearisedTracks(NamedTuple):
     fixed: TrackConstants
 
 
+@shaped("problem.ray: B 3 N, problem.uv: B 2 N, at.shutter_rate: B 3")
 def linearise_tracks(
     problem: PoseDepthProblem, at: Unknowns, *, columns: bool = True, known: TrackConstants | None = None
 ) -> LinearisedTracks:
@@ -195,9 +160,6 @@ def linearise_tracks(
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is fixed at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
-    check(
-        "linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), shutter_rate=(at.shutter_rate, "B 3")
-    )
     known = track_constants(problem) if known is None else known
     seen = known.seen if at.shutter_rate is None else _straighten(known.seen, known.height, at.shutter_rate)
     t = at.T.t[..., None]
@@ -228,26 +190,17 @@ def linearise_tracks(
 
 
 def whitened_residuals(
-    problem: PoseDepthProblem,
-    linear: LinearisedTracks,
-    noise: Tensor,  # (B, N) px²
-    *,
-    shutter_rate: bool = True,
+    linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor], shutter_rate: bool = True
 ) -> Tensor:
     """Whitened rows (B, 10, 2, N) without inverse depths: six columns of the pose, three of the shutter, the residual.
 
     Args:
-        problem, linear: tracks and :func:`linearise_tracks` of them.
-        noise: scale of the tracks' ``shape``.
+        linear: :func:`linearise_tracks` of the tracks.
+        factors: :func:`noise_factors` of their noise.
         shutter_rate: whether the shutter rate has columns; (B, 7, 2, N) without.
 
-    Gradient: to ``linear`` and noise. Raises ValueError for wrong shapes.
+    Gradient: to ``linear`` and the noise.
     """
-    check("whitened_residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    return _whitened_rows(linear, _noise_factors(linear.fixed, noise), shutter_rate)
-
-
-def _whitened_rows(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor], shutter_rate: bool) -> Tensor:
     m0, m1 = (m[:, None] for m in _whitener(linear, factors))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
     if not shutter_rate:
@@ -255,41 +208,30 @@ def _whitened_rows(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tens
     return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
 
-def squared_residuals(
-    problem: PoseDepthProblem,
-    linear: LinearisedTracks,
-    noise: Tensor,  # (B, N) px²
-) -> Tensor:
+def squared_residuals(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """Squared length (B, N) of the whitened residuals; :data:`BEHIND_CAMERA_RESIDUAL` for points behind camera 1.
-
-    Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes.
-    """
-    check("squared_residuals", u=(linear.u, "B n N"), noise=(noise, "B N"))
-    return _squared_lengths(linear, _noise_factors(linear.fixed, noise))
-
-
-def squared_residuals_at(
-    problem: PoseDepthProblem, at: Unknowns, known: TrackConstants | None = None
-) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """:func:`squared_residuals` at fixed unknowns as a function of noise (B, N) px², with the tracks in front (B, N).
-
-    ``known`` is :func:`track_constants` of the problem where already computed.
 
     Gradient: as :func:`whitened_residuals`.
     """
-    constants = track_constants(problem) if known is None else known
+    m0, m1 = _whitener(linear, factors)
+    return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
-    linearised: LinearisedTracks | None = None
 
+def squared_residuals_at(
+    problem: PoseDepthProblem, at: Unknowns, known: TrackConstants
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """:func:`squared_residuals` at fixed unknowns as a function of noise (B, N) px², with the tracks in front (B, N).
+
+    ``known`` is :func:`track_constants` of the problem.
+
+    Gradient: as :func:`whitened_residuals`.
+    """
+
+    @cache
     def linear() -> LinearisedTracks:
-        nonlocal linearised
-        linearised = linearise_tracks(problem, at, columns=False, known=constants) if linearised is None else linearised
-        return linearised
+        return linearise_tracks(problem, at, columns=False, known=known)
 
-    def evaluate(noise: Tensor) -> tuple[Tensor, Tensor]:
-        return _squares(*_track_tensors(problem, constants, _noise_factors(constants, noise), at), linear=linear)
-
-    return evaluate
+    return lambda noise: _squares(*_track_tensors(problem, known, noise_factors(known, noise), at), linear=linear)
 
 
 #: Dtypes of the kernels' inputs, in the order of :func:`_track_tensors`.
@@ -323,10 +265,13 @@ def _track_tensors(
 
 
 def _kernel_arguments(*tensors: Any) -> tuple[Tensor, ...]:
-    """The same tuple for a C++ operator: unknowns contiguous, shutter rate of shape (0, 3) where there is none."""
-    *tracks, R, t, shutter_rate = tensors
-    rate = t.new_empty(0, 3) if shutter_rate is None else shutter_rate.contiguous()
-    return *tracks, R.contiguous(), t.contiguous(), rate
+    """The same tuple for a C++ operator: a shutter rate of shape (0, 3) where there is none."""
+    *tracks, t, shutter_rate = tensors
+    return *tracks, t, t.new_empty(0, 3) if shutter_rate is None else shutter_rate
+
+
+def _depth_limits() -> tuple[float, float, float]:
+    return NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
 
 
 #: Dtypes of numbers in kernels in single and in double precision.
@@ -341,19 +286,21 @@ def _has_whole_lanes(ray: Tensor, *_: Tensor | None, **__: Any) -> bool:
     return ray.shape[-1] % SUM_LANES == 0
 
 
-def _squares_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
-    kernel_args = _kernel_arguments(*tensors)
-    square, front = torch.empty_like(kernel_args[1]), torch.empty_like(kernel_args[2])
-    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.squared_residuals.default(*kernel_args, square, front, *limits)
-    return square, front
-
-
-@operator(kernel=_squares_kernel, dtypes=_TRACK_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
+@operator(
+    kernel=lambda ray, inverse, near, *others, linear: run_kernel(
+        "squared_residuals",
+        _kernel_arguments(ray, inverse, near, *others),
+        (torch.empty_like(inverse), torch.empty_like(near)),
+        *_depth_limits(),
+    ),
+    dtypes=_TRACK_DTYPES,
+    any_layout=("R", "t", "shutter_rate"),
+    when=_has_whole_lanes,
+)
 def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
     """Squared whitened residuals (B, N) of :func:`_track_tensors` linearised as ``linear``, and tracks in front."""
     tracks, (a, b, d) = linear(), tensors[8:11]
-    return _squared_lengths(tracks, (a, b, d)), tracks.front
+    return squared_residuals(tracks, (a, b, d)), tracks.front
 
 
 @torch.no_grad()
@@ -373,16 +320,18 @@ def estimate_noise_variance(
     return _noise(*tensors, tracks=(problem, at, c), rounds=rounds)
 
 
-def _noise_kernel(*tensors: Any, tracks: tuple[PoseDepthProblem, Unknowns, TrackConstants], rounds: int) -> Tensor:
-    kernel_args = _kernel_arguments(*tensors)
-    noise = torch.empty_like(kernel_args[1])
-    numbers = rounds, MEDIAN_2D, MEDIAN_1D, MIN_NOISE_PX**2, MAX_NOISE_PX**2
-    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.track_noise.default(*kernel_args, noise, *numbers, *limits)
-    return noise
-
-
-@operator(kernel=_noise_kernel, dtypes=_NOISE_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
+@operator(
+    kernel=lambda ray, inverse, *others, tracks, rounds: run_kernel(
+        "track_noise",
+        _kernel_arguments(ray, inverse, *others),
+        torch.empty_like(inverse),
+        *(rounds, MEDIAN_2D, MEDIAN_1D, MIN_NOISE_PX**2, MAX_NOISE_PX**2),
+        *_depth_limits(),
+    ),
+    dtypes=_NOISE_DTYPES,
+    any_layout=("R", "t", "shutter_rate"),
+    when=_has_whole_lanes,
+)
 def _noise(*tensors: Any, tracks: tuple[PoseDepthProblem, Unknowns, TrackConstants], rounds: int) -> Tensor:
     """:func:`estimate_noise_variance` of tracks and unknowns."""
     problem, at, known = tracks
@@ -396,11 +345,6 @@ def _noise(*tensors: Any, tracks: tuple[PoseDepthProblem, Unknowns, TrackConstan
         factor = torch.where(problem.far, far, near)
         noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
     return noise
-
-
-def _squared_lengths(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    m0, m1 = _whitener(linear, factors)
-    return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
 def pose_normal_equations(
@@ -436,7 +380,7 @@ def _fixed_tensors(
     """What the cost of tracks contains beside the unknowns."""
     constants = track_constants(problem) if known is None else known
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
-    return constants, _noise_factors(constants, noise), share
+    return constants, noise_factors(constants, noise), share
 
 
 def pose_normal_equations_at(
@@ -533,7 +477,7 @@ def _minimum_kernel(
     *tensors: Any, cost_of: _CostOf, at: Unknowns, robust: _Robust, options: tuple[int, bool]
 ) -> tuple[Unknowns, Tensor]:
     *tracks, share, precision = tensors
-    kernel_args = _kernel_arguments(*tracks)
+    kernel_args = [x.contiguous() for x in _kernel_arguments(*tracks)]
     best = [torch.empty_like(x) for x in kernel_args[-3:]]
     cost = share.new_empty(len(share))
     (steps, rotation_only), (_, bend) = options, robust
@@ -571,26 +515,18 @@ def _minimum(
         free = constant(g, ([1.0] * 3 + [0.0] * 3 + [1.0] * 3)[: g.shape[-1]])
         return NormalEquations(value, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
-    return minimise(evaluate_rotation if rotation_only else normal, at, steps, cost=cost, step=trial_unknowns_step)
+    return minimise(evaluate_rotation if rotation_only else normal, at, steps, cost=cost, move=retract_unknowns)
 
 
 def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:
     *tracks, share = tensors
-    kernel_args = _kernel_arguments(*tracks)
-    B = len(share) if with_equations else 0
-    n = 9 if len(kernel_args[-1]) else 6
-    equations = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
-    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.pose_normal_equations.default(*kernel_args, share, *equations, bend, *limits)
-    return equations
-
-
-def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
-    return _sum_tracks(*tensors, bend=robust[1], with_equations=True)
+    B, n = (len(share) if with_equations else 0), (6 if tracks[-1] is None else 9)
+    sums = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
+    return run_kernel("pose_normal_equations", (*_kernel_arguments(*tracks), share), sums, bend, *_depth_limits())
 
 
 @operator(
-    kernel=_equations_kernel,
+    kernel=lambda *tensors, linear, robust: _sum_tracks(*tensors, bend=robust[1], with_equations=True),
     dtypes=_ANY_PRECISION | {"share": _FLOATS},
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
@@ -598,25 +534,21 @@ def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], rob
 def _equations(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
     """Cost, H and g of :func:`_track_tensors` with the weight ``share`` (B, N) of each track, before any prior."""
     tracks, (a, b, d), shutter_rate, share = linear(), tensors[8:11], tensors[-2], tensors[-1]
-    rows = _whitened_rows(tracks, (a, b, d), shutter_rate is not None)
+    rows = whitened_residuals(tracks, (a, b, d), shutter_rate is not None)
     rho, weight = robust_loss(_square(tracks, rows[:, -1]), *robust)
     H, g = normal_equations(rows, torch.where(tracks.front, weight * share, 0.0), block=SUM_LANES)
     return NormalEquations((rho * share).sum(-1), H, g)
 
 
-def _robust_cost_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
-    return _sum_tracks(*tensors, bend=robust[1], with_equations=False).cost
-
-
 @operator(
-    kernel=_robust_cost_kernel,
+    kernel=lambda *tensors, linear, robust: _sum_tracks(*tensors, bend=robust[1], with_equations=False).cost,
     dtypes=_ANY_PRECISION | {"share": _FLOATS},
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
 def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
     """The cost (B,) of :func:`_equations` alone."""
-    square = _squared_lengths(linear(), tensors[8:11])
+    square = squared_residuals(linear(), tensors[8:11])
     return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
 
 
@@ -645,18 +577,13 @@ def sandwich_sums(
     return _sandwich(*tensors, problem.far, far_weight, reference=reference, robust=robust, limits=limits)
 
 
-def _sandwich_kernel(
-    *tensors: Any, reference: Callable[[], tuple[Tensor, Tensor]], robust: _Robust, limits: tuple[float, float, float]
-) -> tuple[Tensor, Tensor]:
-    *tracks, far, far_weight = tensors
-    bread, meat = (far_weight.new_empty(len(far_weight), 9, 9) for _ in range(2))
-    numbers = robust[1], *limits, NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.pose_sandwich.default(*_kernel_arguments(*tracks), far, far_weight, bread, meat, *numbers)
-    return bread, meat
-
-
 @operator(
-    kernel=_sandwich_kernel,
+    kernel=lambda *tensors, reference, robust, limits: run_kernel(
+        "pose_sandwich",
+        (*_kernel_arguments(*tensors[:-2]), *tensors[-2:]),
+        tensors[-1].new_empty(2, len(tensors[-1]), 9, 9).unbind(),
+        *(robust[1], *limits, *_depth_limits()),
+    ),
     dtypes={name: torch.bool if dtype == torch.bool else torch.float64 for name, dtype in _TRACK_DTYPES.items()}
     | {"far": torch.bool, "far_weight": torch.float64},
     any_layout=("R", "t", "shutter_rate"),
@@ -694,7 +621,7 @@ def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tens
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _noise_factors(constants: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def noise_factors(constants: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which whitens the noise S = L Lᵀ of a track."""
     xx, xy, yy = (constants.shape * noise[:, None]).unbind(1)
     b = xy / xx

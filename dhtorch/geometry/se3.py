@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.pytree import Record, record
 
@@ -63,9 +63,9 @@ def to_matrix(T: Pose) -> Tensor:
     return Rt_to_matrix4x4(T.R, T.t[..., None])
 
 
+@shaped("T.R: B 3 3, xyz: B N 3", "se3.apply")
 def apply(T: Pose, xyz: Tensor) -> Tensor:
     """Points (B, N, 3) of the source frame in the target frame."""
-    check("se3.apply", R=(T.R, "B 3 3"), xyz=(xyz, "B N 3"))
     return rotate(T.R, xyz) + T.t[:, None]
 
 
@@ -110,13 +110,13 @@ def hat(v: Tensor) -> Tensor:
     return So3.hat(v)
 
 
+@shaped("xi: B 6", "se3.exp")
 def exp(xi: Tensor) -> Pose:
     """Exponential map: Pose of tangents (B, 6), rotation vector (rad) then translation part (m).
 
     Closed form with series below 0.1 rad, so that value and gradient are exact at zero as well. Equal to
     ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/geometry/test_kornia.py``).
     """
-    check("se3.exp", xi=(xi, "B 6"))
     omega, upsilon = xi[..., :3], xi[..., 3:]
     theta2 = (omega * omega).sum(-1)[..., None, None]
     small = theta2 < 1e-2
@@ -139,12 +139,12 @@ def exp(xi: Tensor) -> Pose:
     return Pose(eye + a * W + b * W2, (V @ upsilon[..., None])[..., 0])
 
 
+@shaped("T.R: B 3 3, T.t: B 3", "se3.log")
 def log(T: Pose) -> Tensor:
     """Logarithm (B, 6), rotation vector (rad) then translation part (m): ``exp(log(T))`` is T, for rotations below π.
 
     Gradient: to the pose, exact at zero rotation as well. Near π the axis is lost to rounding.
     """
-    check("se3.log", R=(T.R, "B 3 3"), t=(T.t, "B 3"))
     R = T.R
     axis = 0.5 * _rotation_axis(R)
     sin2 = (axis * axis).sum(-1, keepdim=True)
@@ -164,19 +164,19 @@ def log(T: Pose) -> Tensor:
     return torch.cat((omega, T.t - 0.5 * W_t + square[..., 0] * W2_t), -1)
 
 
+@shaped("T.R: B 3 3, T.t: B 3", "se3.adjoint")
 def adjoint(T: Pose) -> Tensor:
     """Adjoint (B, 6, 6), which transports tangents through a motion: ``T · exp(xi) = exp(adjoint(T) @ xi) · T``.
 
     Gradient: to the pose.
     """
-    check("se3.adjoint", R=(T.R, "B 3 3"), t=(T.t, "B 3"))
     top = torch.cat((T.R, torch.zeros_like(T.R)), -1)
     return torch.cat((top, torch.cat((hat(T.t) @ T.R, T.R), -1)), -2)
 
 
+@shaped("T.R: B 3 3, T.t: B 3, xi: B 6", "se3.retract")
 def retract(T: Pose, xi: Tensor) -> Pose:
     """Retraction ``exp(xi) · T`` for tangents (B, 6)."""
-    check("se3.retract", R=(T.R, "B 3 3"), t=(T.t, "B 3"), xi=(xi, "B 6"))
     return compose(exp(xi), T)
 
 

@@ -8,7 +8,7 @@ result that does not depend on the order of the points.
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 
 #: Bits of a key per axis. Source: derived, ⌊63 / 3⌋: three axes fit a non-negative int64.
 CELL_BITS = 21
@@ -20,9 +20,9 @@ CELL_RANGE = 1 << (CELL_BITS - 1)
 OUT_OF_RANGE = -1
 
 
+@shaped("ijk: * 3")
 def pack_cells(ijk: Tensor) -> Tensor:
     """Cells (…, 3) int64 -> keys (…,); :data:`OUT_OF_RANGE` for positions out of range. Gradient: none."""
-    check("pack_cells", ijk=(ijk, "* 3"))
     shifted = ijk + CELL_RANGE
     inside = ((shifted >= 0) & (shifted < 2 * CELL_RANGE)).all(-1)
     x, y, z = shifted.unbind(-1)
@@ -35,6 +35,7 @@ def unpack_cells(key: Tensor) -> Tensor:
     return torch.stack((key >> 2 * CELL_BITS, (key >> CELL_BITS) & mask, key & mask), -1) - CELL_RANGE
 
 
+@shaped("keys: K")
 def find_cells(
     keys: Tensor,  # (K,) int64, rising
     wanted: Tensor,  # (…,) int64
@@ -44,14 +45,14 @@ def find_cells(
     Raises:
         ValueError: wrong shapes.
     """
-    K = check("find_cells", keys=(keys, "K"))["K"]
-    if not K:
+    if not len(keys):
         return torch.zeros_like(wanted), torch.zeros_like(wanted, dtype=torch.bool)
-    position = torch.searchsorted(keys, wanted).clamp_max(K - 1)
+    position = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
     is_present = keys[position] == wanted
     return torch.where(is_present, position, 0), is_present
 
 
+@shaped("xyz: * 3")
 def occupied_cells(
     xyz: Tensor,  # (…, 3) m
     side: float,
@@ -61,7 +62,6 @@ def occupied_cells(
     Raises:
         ValueError: wrong shapes, or a side that is not positive.
     """
-    check("occupied_cells", xyz=(xyz, "* 3"))
     if not side > 0:
         raise ValueError(f"occupied_cells: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
@@ -69,6 +69,7 @@ def occupied_cells(
     return pack_cells(scaled[in_range].floor().long()).unique_consecutive().unique()
 
 
+@shaped("keys: K, others: V")
 def touches_cells(
     keys: Tensor,  # (K,) int64, rising
     others: Tensor,  # (V,) int64, rising
@@ -78,11 +79,11 @@ def touches_cells(
     Raises:
         ValueError: wrong shapes.
     """
-    check("touches_cells", keys=(keys, "K"), others=(others, "V"))
     around = pack_cells(unpack_cells(keys)[:, None] + _neighbour_steps(keys))
     return find_cells(others, around)[1].any(-1)
 
 
+@shaped("keys: K")
 def connected_components(keys: Tensor) -> Tensor:
     """Sorted keys (K,) -> labels (K,) int64 from 0 of the components connected by faces, edges or corners.
 
@@ -93,7 +94,6 @@ def connected_components(keys: Tensor) -> Tensor:
 
     Cost: the logarithm of the longest chain, times 13 look-ups of all cells.
     """
-    check("connected_components", keys=(keys, "K"))
     position, is_present = find_cells(
         keys, pack_cells(unpack_cells(keys)[:, None] + _neighbour_steps(keys)[14:])
     )  # each pair of neighbours once

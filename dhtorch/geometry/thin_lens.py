@@ -11,7 +11,7 @@ so c is positive beyond the focus and negative in front of it. An image determin
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.pytree import Record, record
 
 #: Standard deviation of the Gaussian that replaces a disc, over the disc's diameter, a ratio.
@@ -28,17 +28,18 @@ class Lens(Record):
     pixel_pitch_m: Tensor  # (B,) distance of neighbouring pixels on the sensor
 
 
+@shaped("lens.focal_length_m: B, focus_m: B S")
 def spot_gain(lens: Lens, focus_m: Tensor) -> Tensor:
     """Lens and focus distances (B, S) beyond the focal length -> spot diameter per dioptre out of focus, (B, S) px m.
 
     Gradient: to lens and distances.
     """
-    check("spot_gain", f=(lens.focal_length_m, "B"), focus_m=(focus_m, "B S"))
     f, N, pitch = (x[:, None] for x in (lens.focal_length_m, lens.f_number, lens.pixel_pitch_m))
     beyond = (focus_m - f).clamp_min(1e-9)
     return f * f / N * focus_m / (beyond * pitch)
 
 
+@shaped("depth: B N, focus_m: B")
 def spot_diameter(lens: Lens, depth: Tensor, focus_m: Tensor) -> Tensor:
     """Depth (B, N) m and focus distance (B,) m -> signed spot diameter (B, N) px, positive beyond the focus.
 
@@ -46,13 +47,13 @@ def spot_diameter(lens: Lens, depth: Tensor, focus_m: Tensor) -> Tensor:
 
     Gradient: to lens, depth and distance.
     """
-    check("spot_diameter", depth=(depth, "B N"), focus_m=(focus_m, "B"))
     has_depth = depth > 0
     inverse = 1 / torch.where(has_depth, depth, torch.ones_like(depth))
     c = spot_gain(lens, focus_m[:, None]) * (1 / focus_m[:, None] - inverse)
     return torch.where(has_depth, c, torch.full_like(c, torch.nan))
 
 
+@shaped("diameter: B N, focus_m: B")
 def depth_of_spot(lens: Lens, diameter: Tensor, focus_m: Tensor) -> Tensor:
     """*Signed* spot diameter (B, N) px and focus distance (B,) m -> depth (B, N) m; inverse of :func:`spot_diameter`.
 
@@ -60,7 +61,6 @@ def depth_of_spot(lens: Lens, diameter: Tensor, focus_m: Tensor) -> Tensor:
 
     Gradient: to lens, diameter and distance.
     """
-    check("depth_of_spot", diameter=(diameter, "B N"), focus_m=(focus_m, "B"))
     inverse = 1 / focus_m[:, None] - diameter / spot_gain(lens, focus_m[:, None])
     has_depth = inverse > 0
     depth = 1 / torch.where(has_depth, inverse, torch.ones_like(inverse))

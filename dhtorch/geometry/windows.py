@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 
 #: Largest number of pixels that are processed at once: few enough to stay in the cache and to need no fresh memory.
 #: Source: derived, fits the L2/L3 cache.
@@ -61,13 +61,12 @@ def window_range(q: Tensor, radius: int) -> Tensor:
     return window_extreme(q, radius, torch.maximum) - window_extreme(q, radius, torch.minimum)
 
 
-def _smooth_kernel(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
-    out = torch.empty_like(q)
-    torch.ops.dhtorch.smooth_within_tolerance.default(q, tolerance, out, radius)
-    return out
-
-
-@operator(kernel=_smooth_kernel, dtypes={"q": torch.float32, "tolerance": torch.float32})
+@operator(
+    kernel=lambda q, tolerance, radius=4: run_kernel(
+        "smooth_within_tolerance", (q, tolerance), torch.empty_like(q), radius
+    ),
+    dtypes={"q": torch.float32, "tolerance": torch.float32},
+)
 def smooth_within_tolerance(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
     """Inverse depths q (B, h, w) -> smoothed along columns, then rows, over values within ``tolerance`` (B,) 1/m.
 

@@ -1,11 +1,9 @@
 """Dispatch of operators: a torch function, the reference, and an optional compiled kernel of the same result.
 
-    def _scale_kernel(x, *, factor):
-        out = torch.empty_like(x)
-        torch.ops.dhtorch.scale.default(x, out, factor)
-        return out
-
-    @operator(kernel=_scale_kernel, dtypes={"x": torch.float32})
+    @operator(
+        kernel=lambda x, *, factor: run_kernel("scale", [x], torch.empty_like(x), factor),
+        dtypes={"x": torch.float32},
+    )
     def scale(x, *, factor):
         return x * factor
 
@@ -19,7 +17,7 @@ gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
 """
 
 import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -89,6 +87,14 @@ def operator(
         return dispatched
 
     return decorate
+
+
+def run_kernel(name: str, inputs: Iterable[Tensor], outputs: Any, *numbers: Any) -> Any:
+    """Run ``torch.ops.dhtorch.<name>`` on the inputs, made contiguous, outputs (a tensor or several) and numbers -> the
+    outputs."""
+    filled = (outputs,) if isinstance(outputs, Tensor) else outputs
+    getattr(torch.ops.dhtorch, name).default(*(x.contiguous() for x in inputs), *filled, *numbers)
+    return outputs
 
 
 def is_in_use() -> bool:

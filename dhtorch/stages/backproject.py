@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import all_finite, check, is_transformed
+from dhtorch.geometry.checks import all_finite, check, is_transformed, shaped
 from dhtorch.geometry.patches import (
     containing_pixels,
     extract_patches,
@@ -23,8 +23,8 @@ from dhtorch.geometry.patches import (
     luma,
     nearest_pixel_index,
     reduce_patches,
+    run_window_kernel,
     whole_is_faster,
-    window_arguments,
 )
 from dhtorch.geometry.sensor_noise import get_sensor_noise
 from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
@@ -41,6 +41,7 @@ MAX_HIGHLIGHT_COLOUR_REL = 0.15
 MIN_HIGHLIGHT_CONTRAST = 0.1
 
 
+@shaped("frame.image: B C H W, frame.depth: B h w, frame.conf: B h w")
 def backproject(
     frame: Frame,
     uv: Tensor,  # (N, 2) or (B, N, 2) px
@@ -90,11 +91,8 @@ def backproject(
     Gradient: ``xyz`` to depth, intrinsics and ``uv``; the choice of the depth pixel, flags and confidence carry none.
     Source: paper, "Spiral sampling and confidence-aware sparse 3D".
     """
-    sizes = check(
-        "backproject", image=(frame.image, "B C H W"), depth=(frame.depth, "B h w"), conf=(frame.conf, "B h w")
-    )
     if uv.dim() == 2:
-        uv = uv.expand(sizes["B"], *uv.shape)
+        uv = uv.expand(len(frame.image), *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
     limits = ReturnLimits(
         near_limit=near_limit,
@@ -275,16 +273,10 @@ def _read_depth(
     return value, level, edge
 
 
-def _window_extremes_kernel(depth: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
-    *windows, shape = window_arguments(depth, pixel, size)
-    extremes = depth.new_empty(2, *pixel.shape[:2])
-    torch.ops.dhtorch.window_extremes.default(*windows, extremes, *shape)
-    low, high = extremes.unbind(0)
-    return low, high
-
-
 @operator(
-    kernel=_window_extremes_kernel,
+    kernel=lambda depth, pixel, *, size: tuple(
+        run_window_kernel("window_extremes", (depth, pixel, size), depth.new_empty(2, *pixel.shape[:2]))
+    ),
     dtypes={"depth": torch.float32, "pixel": torch.int32},
     any_layout=("depth",),
     when=fits_window_kernel,
@@ -359,15 +351,12 @@ def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Ten
     return ~is_patch_inside(pixel, hw, size), *doubts
 
 
-def _window_brightness_kernel(image: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, ...]:
-    *windows, shape = window_arguments(image, pixel, size)
-    brightness = image.new_empty(4, *pixel.shape[:2], dtype=torch.float32)
-    torch.ops.dhtorch.window_brightness.default(*windows, brightness, *shape)
-    return brightness.unbind(0)
-
-
 @operator(
-    kernel=_window_brightness_kernel,
+    kernel=lambda image, pixel, *, size: tuple(
+        run_window_kernel(
+            "window_brightness", (image, pixel, size), image.new_empty(4, *pixel.shape[:2], dtype=torch.float32)
+        )
+    ),
     dtypes={"image": torch.uint8, "pixel": torch.int32},
     any_layout=("image",),
     when=fits_window_kernel,

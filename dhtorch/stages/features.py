@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.checks import check, constant
+from dhtorch.geometry.checks import constant, shaped
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import is_inside_picture
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
@@ -37,6 +37,7 @@ class _Matches(NamedTuple):
     A: Tensor  # (M, 2, 2) d uv_1 / d uv_0, the identity where the matcher does not estimate it
 
 
+@shaped("image_0: B C H W, uv_0: B N 2, image_1: B c h w")
 def match_features(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -79,8 +80,6 @@ def match_features(
     Gradient: none; ``lucas_kanade_affine(track=match_features)`` adds one.
     Cost: that of the matcher for each pair, and samples × matches.
     """
-    check("match_features", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"))
-    check("match_features", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     if neighbours <= _PLANE_PARAMETERS or not reach > 0:
         raise ValueError(f"match_features: neighbours {neighbours}, reach {reach}, expected > 3 and > 0")
     with torch.no_grad():

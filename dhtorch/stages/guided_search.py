@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check, constant
+from dhtorch.geometry.checks import constant, shaped
 from dhtorch.geometry.coarse_flow import DownscaledImage, downscale
 from dhtorch.geometry.determinism import chunk_size
 from dhtorch.geometry.lucas_kanade import masked_apply
@@ -85,6 +85,7 @@ class _SearchLimits(NamedTuple):
     exclusion: int
 
 
+@shaped("image_0: B C H W, samples.xyz: B N 3, wanted: B N, images_1: V B C h w, T_1_from_0.t: V B 3")
 def guided_search(
     samples: Samples,
     image_0: Tensor,  # (B, C, H, W)
@@ -124,8 +125,6 @@ def guided_search(
     Gradient: none; a choice. The tracker refines from it.
     Cost: wanted samples x views x (hypotheses x 49 + 1,400) values of grey.
     """
-    check("guided_search", image_0=(image_0, "B C H W"), xyz=(samples.xyz, "B N 3"), wanted=(wanted, "B N"))
-    check("guided_search", image_0=(image_0, "B C H W"), images_1=(images_1, "V B C h w"), t=(T_1_from_0.t, "V B 3"))
     if hypotheses < 3:
         raise ValueError(f"guided_search: hypotheses is {hypotheses}, expected at least 3")
     with torch.no_grad():

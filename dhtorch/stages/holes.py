@@ -11,19 +11,21 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.checks import all_finite, check, is_transformed
+from dhtorch.geometry.checks import all_finite, is_transformed, shaped
 from dhtorch.geometry.linalg import eigenvalues_2x2
 from dhtorch.geometry.patches import (
     containing_pixels,
     fits_window_kernel,
+    flatten_images,
     product_is_exact,
     reduce_patches,
-    window_arguments,
+    run_window_kernel,
 )
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 from dhtorch.records import MIN_TRACKABILITY, Frame, Samples
 
 
+@shaped("frame.image: B C H W, samples.uv: B N 2, samples.flag: B N")
 def classify(
     frame: Frame,
     samples: Samples,
@@ -52,20 +54,15 @@ def classify(
     Cost: reads (block + 2)² pixels per sample, whatever the image size.
     Source: paper, "Hole taxonomy"; J. Shi, C. Tomasi, "Good features to track", 1994.
     """
-    check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
     hole = _classify_holes(samples.xyz, samples.flag, trackability, min_trackability=min_trackability)
     return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
 
 
-def _classify_holes_kernel(xyz: Tensor, flag: Tensor, trackability: Tensor, *, min_trackability: float) -> Tensor:
-    hole = torch.empty_like(flag)
-    torch.ops.dhtorch.classify_holes.default(xyz, flag, trackability, hole, min_trackability)
-    return hole
-
-
 @operator(
-    kernel=_classify_holes_kernel,
+    kernel=lambda xyz, flag, *others, min_trackability: run_kernel(
+        "classify_holes", (xyz, flag, *others), torch.empty_like(flag), min_trackability
+    ),
     dtypes={"xyz": torch.float32, "flag": torch.int32, "trackability": torch.float32},
 )
 def _classify_holes(xyz: Tensor, flag: Tensor, trackability: Tensor, *, min_trackability: float) -> Tensor:
@@ -88,6 +85,7 @@ def _class_of_flag(device: torch.device) -> Tensor:
     )
 
 
+@shaped("image: B C H W, uv: B N 2")
 def min_eigenvalue(
     image: Tensor,  # (B, C, H, W)
     uv: Tensor,  # (B, N, 2) px
@@ -102,20 +100,16 @@ def min_eigenvalue(
 
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
-    check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
     return _window_texture(image, containing_pixels(uv), size=block + 2)
 
 
-def _window_texture_kernel(image: Tensor, pixel: Tensor, *, size: int) -> Tensor:
-    *windows, shape = window_arguments(image, pixel, size)
-    eigenvalue = image.new_empty(pixel.shape[:2], dtype=torch.float32)
-    interleaved = shape[3] == 3
-    torch.ops.dhtorch.window_texture.default(*windows, eigenvalue, *shape, interleaved and product_is_exact(image))
-    return eigenvalue
-
-
 @operator(
-    kernel=_window_texture_kernel,
+    kernel=lambda image, pixel, *, size: run_window_kernel(
+        "window_texture",
+        (image, pixel, size),
+        image.new_empty(pixel.shape[:2], dtype=torch.float32),
+        flatten_images(image)[1][3] == 3 and product_is_exact(image),
+    ),
     dtypes={"image": torch.uint8, "pixel": torch.int32},
     any_layout=("image",),
     when=fits_window_kernel,

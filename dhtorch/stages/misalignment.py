@@ -17,10 +17,10 @@ from torch import Tensor
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, ransac
-from dhtorch.geometry.checks import all_finite, any_possible, check, constant
+from dhtorch.geometry.checks import all_finite, any_possible, constant, shaped
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.reprojection_problem import MEDIAN_1D, MIN_NOISE_PX, undo_rolling_shutter
-from dhtorch.ops.dispatch import operator
+from dhtorch.ops.dispatch import operator, run_kernel
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 
@@ -58,6 +58,7 @@ class _Parallax(NamedTuple):
     used: Tensor  # (B, N) bool
 
 
+@shaped("samples.xyz: B N 3, tracks.uv_1: B N 2, fit.T_1_from_0.R: B 3 3, camera_0.f: B 2, camera_1.f: B 2")
 def reject_misaligned(
     samples: Samples,
     tracks: Tracks,
@@ -95,8 +96,6 @@ def reject_misaligned(
     Gradient: to the poses that stay; whether they do carries none.
     Cost: linear in N; two triangulations and 17 evaluations of the residuals along the epipolar lines.
     """
-    check("reject_misaligned", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
-    check("reject_misaligned", f_0=(camera_0.f, "B 2"), f_1=(camera_1.f, "B 2"))
     reject = partial(
         _reject, max_unexplained=max_unexplained, min_gain=min_gain, few_returns=few_returns, min_t_snr=min_t_snr
     )
@@ -161,15 +160,13 @@ def _intrinsics(*cameras: Camera) -> tuple[Tensor, ...]:
 
 
 def _parallax_kernel(*tensors: Any) -> _Parallax:
-    sigma, t, rate = tensors[4], tensors[7], tensors[8]
-    inputs = [x.contiguous() for x in (*tensors[:8], t.new_empty(0, 3) if rate is None else rate, *tensors[9:])]
-    p, q, a, variance_rel = (torch.empty_like(inputs[4]) for _ in range(4))
-    uv, used = (torch.empty_like(inputs[k]) for k in (0, 2))
-    noise = sigma.new_empty(len(sigma), 1)
+    uv_0, valid, sigma, t, rate = (tensors[k] for k in (0, 2, 4, 7, 8))
+    p, q, a, variance_rel = sigma.new_empty(4, *sigma.shape)
+    uv, noise, used = uv_0.new_empty(uv_0.shape), sigma.new_empty(len(sigma), 1), valid.new_empty(valid.shape)
     near = _Parallax(uv, p, q, a, variance_rel=variance_rel, noise=noise, used=used)
+    inputs = *tensors[:8], t.new_empty(0, 3) if rate is None else rate, *tensors[9:]
     # .04 of depth is always tolerated beside the returns' own sigma: distortion and registration of sensors.
-    torch.ops.dhtorch.near_parallax.default(*inputs, *near, 0.04, MEDIAN_1D, MIN_NOISE_PX)
-    return near
+    return run_kernel("near_parallax", inputs, near, 0.04, MEDIAN_1D, MIN_NOISE_PX)
 
 
 #: What the kernel reads: fields of tracks, samples and fit, the shutter rate (B, 3) or None, both cameras' intrinsics.
@@ -230,16 +227,6 @@ def _profile_cost(near: _Parallax, p: Tensor, used: Tensor, scale: Tensor | None
     return _mean_cost(near.q, near.a, near.variance_rel, near.noise, *(p, used, scale))
 
 
-def _mean_cost_kernel(*tensors: Any) -> Tensor:
-    *inputs, scale = tensors
-    p = inputs[4]
-    cost = p.new_empty(p.shape[:2])
-    start = p.new_empty(0, p.shape[1]) if scale is None else scale.contiguous()
-    # In 4 reweighted steps.
-    torch.ops.dhtorch.profile_cost.default(*(x.contiguous() for x in inputs), start, cost, COST_BEND, 4)
-    return cost
-
-
 #: What the kernel reads: fields of :class:`_Parallax` (B, N) and (B, 1), then the arguments of :func:`_profile_cost`.
 _COST_DTYPES = {
     name: torch.bool if name == "used" else torch.float32
@@ -247,7 +234,17 @@ _COST_DTYPES = {
 }
 
 
-@operator(kernel=_mean_cost_kernel, dtypes=_COST_DTYPES, any_layout=tuple(_COST_DTYPES))
+# The kernel takes 4 reweighted steps.
+@operator(
+    kernel=lambda *tensors: run_kernel(
+        "profile_cost",
+        (*tensors[:6], tensors[4].new_empty(0, tensors[4].shape[1]) if tensors[6] is None else tensors[6]),
+        tensors[4].new_empty(tensors[4].shape[:2]),
+        *(COST_BEND, 4),
+    ),
+    dtypes=_COST_DTYPES,
+    any_layout=tuple(_COST_DTYPES),
+)
 def _mean_cost(*tensors: Any) -> Tensor:
     """:func:`_profile_cost` of tensors."""
     q, a, variance_rel, noise = (x[:, None] for x in tensors[:4])

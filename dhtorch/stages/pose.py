@@ -11,7 +11,7 @@ from torch.utils import _pytree as pytree
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, p3p, ransac, reprojection_problem, se3
-from dhtorch.geometry.checks import all_finite, all_known, check
+from dhtorch.geometry.checks import all_finite, shaped
 from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, round_up
 from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import (
@@ -29,7 +29,6 @@ from dhtorch.geometry.least_squares import (
     robust_loss,
     select_batch,
     solve_spd,
-    trial_pose_step,
 )
 from dhtorch.geometry.linalg import upper_triangle
 from dhtorch.geometry.map_estimate import FitOptions, estimate_map_pose, pose_covariance
@@ -45,6 +44,7 @@ MAP_CHUNK_PAIRS = 16
 MAX_SEARCH_POINTS = 256
 
 
+@shaped("samples.xyz: B N 3, tracks.uv_1: B N 2, tracks.valid: B N, camera_1.f: B 2, draws: B H 3")
 def pnp_ransac(
     samples: Samples,
     tracks: Tracks,
@@ -121,14 +121,6 @@ def pnp_ransac(
         >>> fit.T_1_from_0.t[1]
         tensor([nan, nan, nan])
     """
-    check(
-        "pnp_ransac",
-        xyz=(samples.xyz, "B N 3"),
-        uv_1=(tracks.uv_1, "B N 2"),
-        valid=(tracks.valid, "B N"),
-        f_1=(camera_1.f, "B 2"),
-        draws=(draws, "B H 3"),
-    )
     options = _Options(
         threshold_px=threshold_px,
         min_inlier=max(4, min_inlier),
@@ -242,7 +234,6 @@ def _near_pose(points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tens
             (~(solved & finite), PoseCode.DEGENERATE),
             otherwise=PoseCode.OK,
         )
-        ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
         total = torch.where(inlier, square, 0.0).detach().sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(1e-6)
@@ -252,23 +243,8 @@ def _near_pose(points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tens
         lower = torch.linalg.cholesky_ex(H.detach()).L[:, 3:, 3:]
         whitened = (lower * T.t[..., None]).sum(1)
         t_snr = (whitened * whitened).sum(-1).sqrt() / sigma_px
-
-    all_ok = all_known(ok)  # then no masking is needed
-
-    def answer(x: Tensor) -> Tensor:
-        x = x.to(nan.dtype)
-        return x if all_ok else torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, nan)
-
-    return PoseFit(
-        T_1_from_0=Pose(answer(T.R), answer(T.t)),
-        cov=answer(cov),
-        inlier=inlier & ok[:, None],
-        n_inlier=n_inlier,
-        rms_px=answer(rms_px),
-        sigma_px=answer(sigma_px),
-        t_snr=answer(t_snr),
-        code=code,
-    )
+    fit = PoseFit(T, cov, inlier, n_inlier, rms_px=rms_px, sigma_px=sigma_px, t_snr=t_snr, code=code)
+    return fit.to(points.dtype).without_pose(code != PoseCode.OK, code)
 
 
 def _inlier_normal_equations(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]:
@@ -325,12 +301,12 @@ def _robust_pose(
     near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
     normal, cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
-    flat, cost = minimise(normal, flat, options.local_optimisation, cost=cost_of, step=trial_pose_step)
+    flat, cost = minimise(normal, flat, options.local_optimisation, cost=cost_of, move=move_pose)
     best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
     normal, cost_of = _truncated(
         points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
     )
-    T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_pose_step)
+    T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, move=move_pose)
     return Pose(se3.orthonormal(T.R.double()), T.t.double()), valid
 
 
@@ -368,6 +344,7 @@ def _truncated(
     return normal, cost
 
 
+@shaped("samples.xyz: B N 3, tracks.uv_1: B N 2, tracks.cov: B N 2 2")
 def map_pose(
     samples: Samples,
     tracks: Tracks,
@@ -456,7 +433,6 @@ def map_pose(
         >>> bool((off.abs() < 0.01).all()), bool((off.abs() < 4 * sigma).all())
         (True, True)
     """
-    check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))
     first = start(samples, tracks, camera_0, camera_1, draws)
     options = FitOptions(
         far_weight=far_weight,
@@ -477,7 +453,6 @@ def map_pose(
 
 
 def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDepthProblem, tracks: Tracks) -> PoseFit:
-    N = tracks.uv_1.shape[1]
     eye = se3.identity(len(first.code), problem.f)
     solution = estimate_map_pose(problem.detach(), select_batch(first.ok, first.T_1_from_0.detach(), eye), o)
     # The last step, in float64 and with the graph on.
@@ -493,7 +468,8 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
         bend=o.bend,
     )
     _, H, g = normal(problem, solution.at)
-    at, solved = reprojection_problem.unknowns_step(solution.at, H.detach(), g.detach())
+    xi, solved = solve_spd(H.detach(), -g.detach()[..., None])
+    at = reprojection_problem.retract_unknowns(solution.at, xi[..., 0])
     fixed = problem.detach()
     if has_graph(g):
         at = reprojection_problem.retract_unknowns(
@@ -512,21 +488,18 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
         variance = torch.where(problem.far.any(-1), far_noise, solution.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
     assert at.shutter_rate is not None  # estimate_map_pose returns one, zero where not accepted
-
-    def answer(x: Tensor) -> Tensor:
-        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
-
-    return PoseFit(
-        T_1_from_0=Pose(answer(at.T.R), answer(at.T.t)),
-        cov=answer(cov[:, :6, :6]),
-        inlier=(inlier & ok[:, None])[:, :N],
+    fit = PoseFit(
+        T_1_from_0=at.T,
+        cov=cov[:, :6, :6],
+        inlier=inlier[:, : tracks.uv_1.shape[1]],
         n_inlier=torch.where(ok, inlier.sum(-1), first.n_inlier),
-        rms_px=answer(rms_px),
-        sigma_px=answer(variance.sqrt()),
-        t_snr=answer(t_snr),
+        rms_px=rms_px,
+        sigma_px=variance.sqrt(),
+        t_snr=t_snr,
         code=code,
-        shutter=Shutter(answer(at.shutter_rate), answer(cov)),
+        shutter=Shutter(at.shutter_rate, cov),
     )
+    return fit.to(tracks.uv_1.dtype).without_pose(~ok, code)
 
 
 def _pose_depth_problem(

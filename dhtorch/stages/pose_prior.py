@@ -13,7 +13,7 @@ from torch import Tensor
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import covariance, ransac, se3
 from dhtorch.geometry import pose_conventions as conventions
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.determinism import PRODUCT_LANES, round_up
 from dhtorch.geometry.least_squares import MIN_DEPTH, linearise, select_batch
 from dhtorch.geometry.linalg import small_matmul
@@ -32,6 +32,10 @@ class _NearTracks(NamedTuple):
     used: Tensor  # (B, N) bool
 
 
+@shaped(
+    "samples.xyz: B N 3, tracks.uv_1: B N 2, prior.T_1_from_0.R: B 3 3, prior.T_1_from_0.t: B 3, "
+    "prior.cov: B 6 6, camera_1.f: B 2, fit.code: B"
+)
 def check_pose_prior(
     prior: PosePrior,
     samples: Samples,
@@ -84,18 +88,7 @@ def check_pose_prior(
     Gradient: R and t to the given pose; whether it is used, its covariance and the rest carry none.
     Cost: linear in N.
     """
-    check(
-        "check_pose_prior",
-        xyz=(samples.xyz, "B N 3"),
-        uv_1=(tracks.uv_1, "B N 2"),
-        R=(prior.T_1_from_0.R, "B 3 3"),
-        t=(prior.T_1_from_0.t, "B 3"),
-        cov=(prior.cov, "B 6 6"),
-        f_1=(camera_1.f, "B 2"),
-        code=(fit.code, "B"),
-    )
     T = prior.T_1_from_0.to(samples.xyz.dtype)
-    N = samples.uv.shape[1]
     with torch.no_grad():
         finite = T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
         if prior.cov is not None:
@@ -139,7 +132,7 @@ def check_pose_prior(
             (unconfirmed, PoseCode.TOO_FEW),
             otherwise=PoseCode.OK,
         )
-        ok, inlier = code == PoseCode.OK, explained & near.used
+        inlier = explained & near.used
         square = _square(near, prior_pose, camera_1, None, None)
         rms_px = (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
         convention = torch.zeros_like(code)
@@ -147,29 +140,25 @@ def check_pose_prior(
             convention = torch.where(
                 refuted, _matched_convention(near, prior.hypotheses, camera_1, rigid_near, floor_px), convention
             )
-
-    def answer(x: Tensor) -> Tensor:
-        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan)
-
     return PoseFit(
-        T_1_from_0=Pose(answer(T.R), answer(T.t)),
-        cov=answer(cov),
-        inlier=(inlier & ok[:, None])[:, :N],
+        T_1_from_0=T,
+        cov=cov,
+        inlier=inlier[:, : samples.uv.shape[1]],
         n_inlier=inlier.sum(-1),
-        rms_px=answer(rms_px),
-        sigma_px=answer(torch.where(fit.ok, fit.sigma_px.to(rms_px), 1.0)),
-        t_snr=answer(t_snr),
+        rms_px=rms_px,
+        sigma_px=torch.where(fit.ok, fit.sigma_px.to(rms_px), 1.0),
+        t_snr=t_snr,
         code=code,
         matched_convention=convention,
-    )
+    ).without_pose(code != PoseCode.OK, code)
 
 
+@shaped("fit.T_1_from_0.R: B 3 3, fit.code: B, prior_fit.code: B")
 def reject_poses(fit: PoseFit, prior_fit: PoseFit) -> PoseFit:
     """A fit without the poses that ``prior_fit`` (:func:`check_pose_prior`) has as REFUTED or TOO_FEW, with that code.
 
     Raises ValueError for wrong shapes. Gradient: to the poses that stay.
     """
-    check("reject_poses", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_prior=(prior_fit.code, "B"))
     rejected = fit.ok & ((prior_fit.code == PoseCode.REFUTED) | (prior_fit.code == PoseCode.TOO_FEW))
     return fit.without_pose(rejected, prior_fit.code)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dhtorch.codes import Gate
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 from dhtorch.runtime import storage
@@ -36,6 +36,7 @@ SCORE_FEATURES: dict[str, tuple[float, float]] = {
 MAX_LOG_FACTOR = 4.0
 
 
+@shaped("estimate.gate: B N, samples.uv: B N 2, tracks.valid: B N")
 def confidence(
     estimate: Estimate,
     samples: Samples,
@@ -68,14 +69,14 @@ def confidence(
     Gradient: to parallax and residual; the threshold carries none.
     Source: paper, "Selective confidence".
     """
-    check("confidence", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     parallax, residual = estimate.parallax_deg, estimate.residual_px
     stated = estimate.keep & parallax.isfinite() & residual.isfinite()
-    parallax, residual = (torch.where(stated, x, torch.zeros_like(x)) for x in (parallax, residual))
+    parallax, residual = (torch.where(stated, x, 0.0) for x in (parallax, residual))
     score = parallax / (parallax + half_parallax_deg) * (1 - residual / residual_scale_px).clamp_min(0)
     return _apply_min_score(estimate, score, min_score)
 
 
+@shaped("estimate.gate: B N, samples.uv: B N 2, tracks.valid: B N")
 def confidence_from_error(
     estimate: Estimate,
     samples: Samples,
@@ -115,20 +116,16 @@ def confidence_from_error(
 
     Gradient: to sigma, depth, residual and the other terms used; the threshold carries none.
     """
-    check("confidence_from_error", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     terms = [(estimate.residual_px, residual_scale_px)]
     if photometric_scale is not None:
         terms.append((tracks.photometric, photometric_scale))
     if round_trip_scale_px is not None:
         terms.append((tracks.error, round_trip_scale_px))
     expected, stated = _expected_error(estimate, terms)
-    zero = torch.zeros_like(expected)
-    score = torch.where(stated, half_error / (half_error + expected), zero)
-    if recalibration is not None:
-        score = torch.where(stated, recalibration(score), zero)
-    return _apply_min_score(estimate, score, min_score)
+    return _scored(estimate, expected, stated, half_error, min_score, recalibration)
 
 
+@shaped("estimate.gate: B N, samples.uv: B N 2, tracks.valid: B N")
 def confidence_from_sigma(
     estimate: Estimate,
     samples: Samples,
@@ -157,18 +154,13 @@ def confidence_from_sigma(
 
     Gradient: to sigma and depth; the threshold carries none.
     """
-    check("confidence_from_sigma", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     stated = estimate.keep & (estimate.depth > 0) & estimate.sigma.isfinite()
-    depth = torch.where(stated, estimate.depth, torch.ones_like(estimate.depth))
-    sigma = torch.where(stated, estimate.sigma, torch.ones_like(estimate.sigma))
+    depth, sigma = (torch.where(stated, x, 1.0) for x in (estimate.depth, estimate.sigma))
     expected = (sigma / depth).clamp(max=MAX_RATIO) / (estimate.n_views - 1).clamp_min(1).to(depth).sqrt()
-    zero = torch.zeros_like(expected)
-    score = torch.where(stated, half_error / (half_error + expected), zero)
-    if recalibration is not None:
-        score = torch.where(stated, recalibration(score), zero)
-    return _apply_min_score(estimate, score, min_score)
+    return _scored(estimate, expected, stated, half_error, min_score, recalibration)
 
 
+@shaped("estimate.gate: B N, samples.uv: B N 2, tracks.valid: B N, fit.inlier: B N")
 def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
     """Features of every answer for a learned score: logarithms (B, N, 8) in the order of :data:`SCORE_FEATURES`.
 
@@ -180,31 +172,22 @@ def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: Po
 
     Gradient: to depth, sigma, parallax and residual; zero beyond the limits and where there is no answer.
     """
-    check(
-        "score_features",
-        gate=(estimate.gate, "B N"),
-        uv=(samples.uv, "B N 2"),
-        valid=(tracks.valid, "B N"),
-        inlier=(fit.inlier, "B N"),
-    )
     terms = [(estimate.residual_px, 0.5), (tracks.error, 0.4)]
     expected, stated = _expected_error(estimate, terms)
     evidence = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
     for x in evidence:
         stated = stated & x.isfinite()
-    one, zero = torch.ones_like(expected), torch.zeros_like(expected)
-    depth = torch.where(stated, estimate.depth, one)
+    depth = torch.where(stated, estimate.depth, 1.0)
     inlier = fit.inlier & (samples.depth > 0)
-    mean_near_depth = torch.where(inlier, samples.depth, zero).sum(-1, keepdim=True) / inlier.sum(
-        -1, keepdim=True
-    ).clamp_min(1)
-    reach = depth / torch.where(mean_near_depth > 0, mean_near_depth, torch.ones_like(mean_near_depth))
-    shared = torch.where(stated, estimate.sigma_shared, zero) / depth
-    columns = (expected, shared, *(torch.where(stated, x, one) for x in evidence), reach)
+    total = torch.where(inlier, samples.depth, 0.0).sum(-1, keepdim=True)
+    mean_near_depth = total / inlier.sum(-1, keepdim=True).clamp_min(1)
+    reach = depth / torch.where(mean_near_depth > 0, mean_near_depth, 1.0)
+    shared = torch.where(stated, estimate.sigma_shared, 0.0) / depth
+    columns = (expected, shared, *(torch.where(stated, x, 1.0) for x in evidence), reach)
     logarithms = [
         pad_elementwise(torch.log, x.clamp(*limits)) for x, limits in zip(columns, SCORE_FEATURES.values(), strict=True)
     ]
-    return torch.stack([torch.where(stated, x, zero) for x in logarithms], -1), stated
+    return torch.stack([torch.where(stated, x, 0.0) for x in logarithms], -1), stated
 
 
 class LearnedScore(nn.Module):
@@ -242,10 +225,8 @@ class LearnedScore(nn.Module):
     def forward(self, estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> Estimate:
         """The estimate with its score; 0 where unanswered or without an expected error."""
         x, stated = score_features(estimate, samples, tracks, fit)
-        e = pad_elementwise(torch.exp, self.log_error(x))
-        zero = torch.zeros_like(e)
-        score = torch.where(stated, self.half_error / (self.half_error + e), zero)
-        return _apply_min_score(estimate, score, self.min_score)
+        expected = pad_elementwise(torch.exp, self.log_error(x))
+        return _scored(estimate, expected, stated, self.half_error, self.min_score)
 
     def log_error(
         self,
@@ -306,6 +287,7 @@ class LearnedScore(nn.Module):
         return cls.from_json(storage.read_utf8(path), str(path))
 
 
+@shaped("log_error: n, error: n, weight: n")
 def expected_error_loss(
     log_error: Tensor,  # (n,) of the scorer
     error: Tensor,  # (n,) actual relative error
@@ -318,7 +300,6 @@ def expected_error_loss(
 
     Gradient: to ``log_error``. Raises ValueError for wrong shapes.
     """
-    check("expected_error_loss", log_error=(log_error, "n"), error=(error, "n"), weight=(weight, "n"))
     return (weight * (log_error + error.clamp(max=1) * (-log_error).exp())).sum()
 
 
@@ -328,29 +309,34 @@ def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tu
     stated = estimate.keep & (depth > 0) & whole.isfinite() & shared.isfinite()
     for x, _ in terms:
         stated = stated & x.isfinite()
-    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    inverse = 1 / torch.where(stated, depth, one)
-    whole = (torch.where(stated, whole, one) * inverse).clamp(max=MAX_RATIO)
-    shared = (torch.where(stated, shared, zero) * inverse).clamp(max=MAX_RATIO)
+    inverse = 1 / torch.where(stated, depth, 1.0)
+    whole = (torch.where(stated, whole, 1.0) * inverse).clamp(max=MAX_RATIO)
+    shared = (torch.where(stated, shared, 0.0) * inverse).clamp(max=MAX_RATIO)
     # The own part is at least 1e-6 of a variance; squares stay in the range of float32.
     own = torch.maximum(whole * whole - shared * shared, 1e-6 * whole * whole).clamp_min(1e-12)
-    spread = one
+    spread = torch.ones_like(depth)
     for x, scale in terms:
-        ratio = (torch.where(stated, x, zero) / scale).clamp(max=MAX_RATIO)
+        ratio = (torch.where(stated, x, 0.0) / scale).clamp(max=MAX_RATIO)
         spread = spread + ratio * ratio
     return (own * spread).sqrt(), stated
 
 
+def _scored(
+    estimate: Estimate,
+    expected: Tensor,
+    stated: Tensor,
+    half_error: float,
+    min_score: float,
+    recalibration: Callable[[Tensor], Tensor] | None = None,
+) -> Estimate:
+    """The estimate with the score h / (h + e), recalibrated, 0 where no error e is stated, under its threshold."""
+    score = torch.where(stated, half_error / (half_error + expected), 0.0)
+    if recalibration is not None:
+        score = torch.where(stated, recalibration(score), 0.0)
+    return _apply_min_score(estimate, score, min_score)
+
+
 def _apply_min_score(estimate: Estimate, score: Tensor, min_score: float) -> Estimate:
     """The estimate with its score; answers below ``min_score`` become unanswered with LOW_SCORE."""
-    low = estimate.keep & (score < min_score)
-    gate = torch.where(low, torch.full_like(estimate.gate, Gate.LOW_SCORE), estimate.gate)
-    keep = gate == Gate.ANSWER
-    nan = torch.full_like(estimate.depth, torch.nan)
-    return estimate.replace(
-        depth=torch.where(keep, estimate.depth, nan),
-        sigma=torch.where(keep, estimate.sigma, nan),
-        sigma_shared=torch.where(keep, estimate.sigma_shared, nan),
-        score=torch.where(keep, score, torch.zeros_like(score)),
-        gate=gate,
-    )
+    score = torch.where(estimate.keep, score, 0.0)
+    return estimate.replace(score=score).withheld(score < min_score, Gate.LOW_SCORE)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import shaped
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 
@@ -27,6 +27,7 @@ MIN_TURN = 1e-4
 MIN_SHARED_POINTS = 12
 
 
+@shaped("estimates.gate: V B N, samples.uv: B N 2, tracks.valid: V B N, fits.T_1_from_0.R: V B 3 3")
 def verify_views(
     samples: Samples,
     tracks: Tracks,  # (V, B, N)
@@ -71,8 +72,6 @@ def verify_views(
     Gradient: sigma to sigma, depth and parallax; the rotation is detached and gates carry none.
     Cost: linear in N and in pairs of views.
     """
-    check("verify_views", gate=(estimates.gate, "V B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "V B N"))
-    check("verify_views", gate=(estimates.gate, "V B N"), R=(fits.T_1_from_0.R, "V B 3 3"))
     far, refuted = ~samples.usable, _refuted_views(estimates, tracks)
     R = fits.T_1_from_0.R.detach()
     R = torch.where(fits.ok[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
@@ -83,13 +82,13 @@ def verify_views(
     if min_ratio is not None:
         used = estimates.keep & far
         is_turn = (_median((parallax / turn).detach(), used) < min_ratio) & (used.sum(-1, keepdim=True) > 0)
-        estimates = _withhold(estimates, is_turn, Gate.NO_BASELINE)
+        estimates = estimates.withheld(is_turn, Gate.NO_BASELINE)
     contradicted = torch.zeros_like(refuted, dtype=torch.bool)
     if max_disagreement is not None:
         contradicted = contradicted | _disagree(estimates, far, max_disagreement, min_disagreement)
     if max_refuted is not None:
         contradicted = contradicted | (refuted >= max_refuted)
-    return _withhold(estimates, contradicted[:, None], Gate.CONTRADICTED)
+    return estimates.withheld(contradicted[:, None], Gate.CONTRADICTED)
 
 
 def _widen(estimates: Estimate, relative: Tensor) -> Estimate:
@@ -105,17 +104,6 @@ def _widen(estimates: Estimate, relative: Tensor) -> Estimate:
         sigma=widened(estimates.sigma),
         sigma_shared=widened(estimates.sigma_shared),
         parts=parts.replace(lens=parts.lens + added),
-    )
-
-
-def _withhold(estimates: Estimate, rejected: Tensor, gate: int) -> Estimate:
-    """The estimates without the answers of the ``rejected`` views, (V, B, 1) or (B, 1), which get ``gate``."""
-    lost = estimates.keep & rejected
-    values = {name: getattr(estimates, name) for name in ("depth", "sigma", "sigma_shared")}
-    return estimates.replace(
-        **{name: x.masked_fill(lost, torch.nan) for name, x in values.items()},
-        score=estimates.score.masked_fill(lost, 0.0),
-        gate=estimates.gate.masked_fill(lost, gate),
     )
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dhtorch.geometry import affine_alignment
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.checks import any_possible, check, constant
+from dhtorch.geometry.checks import any_possible, constant, shaped
 from dhtorch.geometry.coarse_flow import (
     CoarseFlow,
     apply_similarity,
@@ -34,6 +34,7 @@ from dhtorch.records import NO_HINT, TrackHint, Tracks
 MIN_TRACK_EIGENVALUE = 1e-4 * 2**10 / 255**2
 
 
+@shaped("image_0: B C H W, uv_0: B N 2, hint.start: B N 2, image_1: B c h w")
 def lucas_kanade(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -89,7 +90,7 @@ def lucas_kanade(
     step (:func:`refine_tracks`); all other fields are detached.
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
-    against ``cv2.calcOpticalFlowPyrLK`` (``tests/stages/test_track.py``).
+    against ``cv2.calcOpticalFlowPyrLK`` (``tests/functional/test_points.py``).
 
     Example:
         >>> import torch
@@ -106,8 +107,6 @@ def lucas_kanade(
         >>> tracks.valid  # the third is outside image 1
         tensor([[ True,  True, False]])
     """
-    check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
-    check("lucas_kanade", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(iterations, normalise)
     o = lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, normalise)
     levels = levels if hint.levels is None else hint.levels
@@ -144,6 +143,7 @@ def lucas_kanade(
     return tracks
 
 
+@shaped("image_0: B C H W, uv_0: B N 2, uv_1: B N 2, image_1: B c h w")
 def refine_tracks(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -165,8 +165,6 @@ def refine_tracks(
 
     Gradient: to both images and ``uv_0``; ``uv_1`` is detached.
     """
-    check("refine_tracks", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
-    check("refine_tracks", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(1, normalise)
     source = build_pyramid(image_0, 1, window)
     target = build_pyramid(image_1, 1, window, gradients=False)
@@ -306,6 +304,7 @@ def _source_pyramid(hint: TrackHint, image: Tensor, levels: int, window: int) ->
     return hint.pyramid(levels, window)
 
 
+@shaped("image_0: B C H W, uv_0: B N 2, hint.start: B N 2, image_1: B c h w")
 def lucas_kanade_affine(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -344,8 +343,6 @@ def lucas_kanade_affine(
     Gradient: as :func:`lucas_kanade`, by one more step of the registration; all other fields are detached.
     Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on", inverse composition with appearance variation.
     """
-    check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
-    check("lucas_kanade_affine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     with torch.no_grad():
         pyramid = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
         levels = levels if hint.levels is None else hint.levels

@@ -9,7 +9,7 @@ from torch import Tensor
 from dhtorch.codes import Gate, Hole, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
-from dhtorch.geometry.checks import all_finite, check
+from dhtorch.geometry.checks import all_finite, shaped
 from dhtorch.geometry.covariance import masked_median, noise_shape
 from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
@@ -17,6 +17,7 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, SigmaBudget, Tracks
 
 
+@shaped("tracks.uv_0: B N 2, samples.uv: B N 2, fit.T_1_from_0.R: B 3 3")
 def two_view(
     samples: Samples,
     tracks: Tracks,
@@ -99,7 +100,6 @@ def two_view(
     answered pass no gradient.
     Source: paper, "Gated two-view triangulation and abstention".
     """
-    check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
     posed, static = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
     tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1)
     uv_0, uv_1 = _zero_invalid(tracks.uv_0, tracked), _zero_invalid(tracks.uv_1, tracked)

@@ -212,20 +212,6 @@ def test_an_error_above_1_counts_as_1_and_has_no_gradient():
     assert torch.equal(error.grad > 0, error < 1)
 
 
-def test_minimising_it_orders_answers_by_error():
-    """From equal confidences: descent reaches the area of the best order, which is below half of where it began."""
-    _, error = answers(n=40, sets=1)
-    error = error**4
-    confidence = torch.zeros_like(error).requires_grad_()
-    optimiser = torch.optim.Adam([confidence], lr=0.05)
-    for _ in range(200):
-        optimiser.zero_grad()
-        risk_coverage_loss(confidence, error).sum().backward()
-        optimiser.step()
-    reached, best = (float(risk_curve(error[0], c).mean()) for c in (confidence.detach()[0], -error[0]))
-    assert reached < 1.01 * best < 0.5 * float(error.mean())
-
-
 @pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
 def test_a_temperature_is_positive(temperature):
     with pytest.raises(ValueError, match="temperature is"):

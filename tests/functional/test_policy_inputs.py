@@ -100,18 +100,6 @@ def test_fewer_points_are_the_first_of_more_and_they_repeat_when_pixels_run_out(
     assert not fn.point_cloud(torch.zeros(2, 5, 7), K, n=3).any()
 
 
-@pytest.mark.parametrize("n", [64, 300, 1024])
-@pytest.mark.parametrize("hw", [(48, 64), (120, 160)])
-def test_points_cover_the_picture_evenly(n, hw):
-    """Each of 4 × 4 tiles gets its share of the points; columns and rows are all used about equally."""
-    xyz = fn.point_cloud(torch.ones(hw, dtype=torch.float64), torch.eye(3), n=n)
-    v, u = xyz[:, 1].long(), xyz[:, 0].long()
-    tiles = torch.bincount(v * 4 // hw[0] * 4 + u * 4 // hw[1], minlength=16)
-    assert tiles.min() >= 0.5 * n / 16
-    assert tiles.max() < 1.6 * n / 16
-    assert torch.bincount(u).max() <= 4 * max(1, n / hw[1])
-
-
 def test_gradient_of_points():
     depth = (1 + maps(hw=(6, 8))[0]).requires_grad_()  # every pixel has one, so that no step of the check adds it
     lens = torch.tensor([0.01, 0.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)

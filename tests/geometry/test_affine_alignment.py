@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from dhtorch.geometry import affine_alignment
-from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
-from dhtorch.records import TrackHint
+from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 HW = (160, 200)
@@ -171,42 +170,6 @@ def test_contrast_size_shift_and_residual_have_limits(linear, gain, off, options
     some = torch.arange(60)[None] % 3 == 0
     chosen = registered(image_0, image_1, uv, start, wanted=some, **options)
     assert torch.equal(chosen.ok, found.ok & some) and torch.equal(chosen.uv_1[~some], start[~some])
-
-
-def test_only_valid_tracks_have_a_derivative_and_it_is_that_of_one_step():
-    image_0, image_1, warp = warped(SLANTED, (0.4, 0.2))
-    uv = points(8)
-    tracks = lucas_kanade(image_0, image_1, uv)
-    tracks = tracks.replace(uv_1=warp(uv) + 0.2, valid=torch.arange(8)[None] % 2 == 0)
-    leaves = [x.requires_grad_() for x in (image_0, image_1, uv)]
-    found = lucas_kanade_affine(*leaves, track=lambda *_, **__: tracks)
-    pyramids = build_pyramid(image_0, 1), build_pyramid(image_1, 1)
-    linear = registered(image_0, image_1, uv, tracks.uv_1).linear
-    again = affine_alignment.registration_step(*pyramids, uv, found.uv_1, linear)
-    valid = tracks.valid
-    for slope, want in zip(
-        *(torch.autograd.grad(x[valid].sum(), leaves, retain_graph=True) for x in (found.uv_1, again)), strict=True
-    ):
-        torch.testing.assert_close(slope, want, rtol=1e-6, atol=1e-9)
-    assert not any(x.any() for x in torch.autograd.grad(found.uv_1[~valid].sum(), leaves))
-    assert not found.cov.requires_grad and not found.error.requires_grad
-
-
-def test_the_search_before_it_has_the_start_the_pyramid_and_the_levels():
-    image_0, image_1, _ = warped(SLANTED, (0.4, 0.2))
-    uv, seen = points(5), []
-
-    def track(*images, hint, **options):
-        seen.append((*images, hint, options))
-        return lucas_kanade(*images, hint=hint, **options)
-
-    made = PyramidCache(image_0)
-    for hint, levels in ((TrackHint(uv + 1, made), 2), (TrackHint(levels=1), 3), (TrackHint(), 4)):
-        lucas_kanade_affine(image_0, image_1, uv, track=track, hint=hint, levels=levels)
-    assert all(x[0] is image_0 and x[1] is image_1 and x[2] is uv and not x[4] for x in seen)
-    hints = [x[3] for x in seen]
-    assert torch.equal(hints[0].start, uv + 1) and hints[0].pyramid is made and hints[2].start is None
-    assert [x.levels for x in hints] == [2, 1, 4] and torch.equal(hints[1].pyramid.image, image_0)
 
 
 def test_an_image_that_only_changes_along_rows_determines_no_motion():

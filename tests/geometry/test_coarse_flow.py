@@ -13,8 +13,7 @@ from dhtorch.geometry import coarse_flow as start
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.determinism import ELEMENTWISE_LANES
 from dhtorch.geometry.pyramid import build_pyramid
-from dhtorch.records import TrackHint, Tracks
-from dhtorch.stages import track
+from dhtorch.records import TrackHint
 from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade, lucas_kanade_affine
 
 H, W = 240, 320
@@ -185,17 +184,6 @@ def test_the_way_back_starts_from_its_own_estimate() -> None:
     assert torch.equal(nowhere.uv_1, track().uv_1) or not nowhere.valid.any()
 
 
-def test_the_gradient_of_a_turned_track_is_finite_and_leaves_its_place() -> None:
-    a, b, _ = _pair(3, (20.0, -12.0), 30.0)
-    uv = torch.tensor([[[150.0, 110.0], [170.0, 130.0]]])
-    plain = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
-    b = b.clone().requires_grad_()
-    tracks = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
-    torch.testing.assert_close(tracks.uv_1.detach(), plain.uv_1)
-    tracks.uv_1.sum().backward()
-    assert b.grad is not None and bool(b.grad.isfinite().all()) and bool((b.grad != 0).any())
-
-
 def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
     """A point that was told where to look is searched for there and nowhere else; one that was not, everywhere."""
     a, b, _ = _pair(5, (40.0, 0.0))
@@ -219,23 +207,3 @@ def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
     assert share(expected + 6.0, every, 2) > 0.8
     half = torch.arange(x.shape[1]) % 2 == 0
     assert share(torch.where(half, expected + 6.0, zero), half, 2) > 0.8, "each by its own"
-
-
-def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
-    """Noise turns and grows with the image, what was found beyond the image is not in it, and a start is undone."""
-    turn = 1.3 * torch.tensor([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
-    linear = torch.stack([turn, torch.eye(2)])
-    middle = torch.tensor([[[W / 2, H / 2]]]).expand(2, 1, 2)
-    none = start.CoarseFlow(middle[:, None], middle[:, None], torch.ones(2, 1, 1), linear, torch.ones(2))
-    image = torch.rand(2, 1, H, W, generator=torch.Generator().manual_seed(0))
-    undone = track._DerotatedImage(image, (none, none))
-    uv = torch.tensor([[150.0, 110.0], [2.0, 3.0], [-3.0, 3.0]]).expand(2, 3, 2)
-    cov = torch.tensor([[4.0, 1.0], [1.0, 0.5]]).expand(2, 3, 2, 2)
-    known = torch.ones(2, 3, dtype=torch.bool)
-    tracks = Tracks(uv_0=uv, uv_1=uv, cov=cov, valid=known, error=torch.zeros(2, 3), photometric=torch.zeros(2, 3))
-    told = undone.to_image(tracks)
-    assert torch.allclose(told.cov[0], turn @ cov[0] @ turn.T) and torch.equal(told.cov[1], cov[1])
-    centre = torch.tensor([(W - 1) / 2, (H - 1) / 2])
-    assert torch.allclose(told.uv_1[0], (uv[0] - centre) @ turn.T + centre, atol=1e-3)
-    assert told.valid.tolist() == [[True, False, False], [True] * 3], "a picture that is not turned is judged elsewhere"
-    assert torch.allclose(undone.begin(uv, told.uv_1), uv, atol=1e-3)

@@ -19,13 +19,6 @@ def test_small_components_are_those_of_a_labelling(share):
     assert not small_components(masks, 1).any()
 
 
-def test_a_winding_line_of_as_many_pixels_is_not_small():
-    line = torch.zeros(1, 9, 9, dtype=torch.bool)
-    line[0, 0, :] = line[0, 2, :] = True
-    line[0, 1, 8] = True  # 19 px in a U
-    assert not small_components(line, 19).any() and torch.equal(small_components(line, 20), line)
-
-
 def test_a_cut_divides_a_component():
     mask = torch.ones(1, 4, 10, dtype=torch.bool)
     right, down = torch.ones(1, 4, 9, dtype=torch.bool), torch.ones(1, 3, 10, dtype=torch.bool)

@@ -110,15 +110,6 @@ def test_without_a_baseline_or_an_angle_depth_is_zero_and_gradients_are_finite()
     assert not epipolar.triangulate(uv, uv, camera, camera, straight).depth.any()
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 8, 9, 24, 1 << 15])
-def test_depths_in_chunks_are_those_of_triangulate(chunk, monkeypatch):
-    monkeypatch.setattr(epipolar, "MAX_CHUNK_TRIANGULATED", chunk)
-    for n in (0, 1, 12):
-        uv_0, uv_1, _ = scene(n, noise_px=1.0)
-        found = epipolar.triangulate_depth(uv_0, uv_1, CAMERA_0, CAMERA_1, MOTIONS)
-        assert torch.equal(found, triangulated(uv_0, uv_1).depth)
-
-
 # ------------------------------------------------------------------------------------------------ what goes with it
 
 

@@ -1,6 +1,5 @@
 """Work without a graph: the same numbers, and tensors that may enter a graph afterwards."""
 
-import pytest
 import torch
 
 from dhtorch.geometry.inference_mode import run_without_grad
@@ -21,16 +20,6 @@ def test_what_comes_out_may_enter_a_graph():
     (weight * out["made"]).sum().backward()  # which a tensor of inference mode refuses
     assert weight.grad.tolist() == [0.0, 2.0, 4.0]
     out["made"] += 1
-
-
-@pytest.mark.parametrize("asks", ["x", "option"])
-def test_a_graph_that_is_asked_for_is_there(asks):
-    x, y = (torch.ones(2, requires_grad=name == asks) for name in ("x", "option"))
-    (out, inside) = run_without_grad(seen, x, y=y)
-    assert not inside
-    assert out["made"].requires_grad == (asks == "x")
-    with torch.no_grad():
-        assert run_without_grad(seen, x, y=y)[1]
 
 
 def test_transforms_and_compilers_see_the_function_itself():

@@ -12,8 +12,7 @@ import torch
 from support.textures import levels, places, waves
 
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES
-from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
+from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.records import TrackHint
 from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade, refine_tracks
 
@@ -165,16 +164,6 @@ def test_where_nothing_is_known_the_start_comes_back():
     torch.testing.assert_close(started.uv_1[:, 3], plain.uv_1[:, 3], atol=0.02, rtol=0)
 
 
-def test_a_hint_has_a_pyramid_and_a_number_of_levels():
-    src, dst = two_views()
-    uv, other = places(2, 8, H, W, margin=12), waves(2, H, W, seed=9)
-    found = lucas_kanade(other, dst, uv, hint=TrackHint(pyramid=PyramidCache(src)), **OPTIONS)
-    want = lucas_kanade(src, dst, uv, **OPTIONS)
-    assert all(torch.equal(getattr(found, f), getattr(want, f)) for f in FIELDS)
-    two = lucas_kanade(src, dst, uv, hint=TrackHint(levels=2), **OPTIONS)
-    assert torch.equal(two.uv_1, lucas_kanade(src, dst, uv, **OPTIONS | {"levels": 2}).uv_1)
-
-
 # --- one step, residual, covariance ----------------------------------------------------------------------------------
 
 
@@ -247,38 +236,7 @@ def test_the_covariance_is_variance_over_texture_kept_from_vanishing():
     np.testing.assert_allclose(broken[..., 0].numpy(), np.eye(2) * 0.5 / 1e-9, rtol=1e-5)
 
 
-def test_a_function_is_applied_to_whole_lanes_of_the_wanted_points():
-    wanted, x, seen = torch.arange(130) % 3 == 0, torch.arange(130.0), []
-
-    def double(x, y):
-        assert x.shape[-1] % ELEMENTWISE_LANES == 0
-        seen.append(x)
-        return 2 * x, y + 1
-
-    first, second = lk.masked_apply(wanted, double, (x, torch.zeros(2, 130)), (x + 5, torch.ones(2, 130)))
-    assert torch.equal(first, torch.where(wanted, 2 * (x + 5), x)) and set(seen[0].tolist()) == set(
-        (x + 5)[wanted].tolist()
-    )
-    assert torch.equal(second, torch.where(wanted, 2.0, 0.0).expand(2, -1))
-    assert lk.masked_apply(wanted & False, double, (x, x), (x, x)) == (x, x) and len(seen) == 1
-
-
 # --- default options, and with a graph -------------------------------------------------------------------------------
-
-
-def test_the_default_search_has_four_levels_windows_of_21_px_30_steps_and_no_normalisation():
-    draw = torch.Generator().manual_seed(0)
-    coarse = torch.rand(1, 1, 50, 50, generator=draw, dtype=torch.float64)
-    src = torch.nn.functional.interpolate(coarse, (340, 340), mode="bicubic")
-    dst = 1.2 * src.roll((9, -6), (2, 3)) + 0.1 * torch.rand(src.shape, generator=draw, dtype=torch.float64)
-    dst[..., :170] = src.flip(3)[..., :170]  # where nothing comes to rest
-    uv = places(1, 24, 340, 340, margin=20)
-    named = {"window": 21, "levels": 4, "iterations": 30, "epsilon_px": 0.01, "max_round_trip_px": 1.0}
-    named |= {"normalise": "none", "min_eigenvalue": 1e-4 * 1024 / 255**2}
-    usual, plain = lucas_kanade(src, dst, uv, **named), lucas_kanade(src, dst, uv)
-    assert all(torch.equal(getattr(usual, f), getattr(plain, f)) for f in FIELDS)
-    for name, value in {"window": 23, "levels": 5, "iterations": 31, "epsilon_px": 0.02}.items():
-        assert not torch.equal(lucas_kanade(src, dst, uv, **named | {name: value}).uv_1, plain.uv_1), name
 
 
 @pytest.mark.parametrize("normalise", NORMALISE)

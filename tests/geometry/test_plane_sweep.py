@@ -222,12 +222,6 @@ def test_rivals_are_the_best_places_further_away():
     )
 
 
-def test_bands_of_rows_cover_a_map_once(monkeypatch):
-    monkeypatch.setattr(neighbours, "MAX_BAND_PIXELS", 40)
-    assert neighbours.row_bands(torch.zeros(2, 1, 1, 1), (7, 5)) == [slice(0, 4), slice(4, 7)]
-    assert neighbours.row_bands(torch.zeros(2, 1, 1, 1, requires_grad=True), (7, 5)) == [slice(0, 7)]
-
-
 def test_windows_are_summed_and_their_spread_is_known():
     q = torch.rand(2, 9, 11, generator=generator(), dtype=torch.float64)
     padded = torch.nn.functional.pad(q[:, None], (4, 4, 4, 4), mode="replicate")[:, 0]

@@ -75,17 +75,6 @@ def test_the_whole_motion_is_the_matrix_exponential():
         )
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-7, 0.05, 0.0999, 0.1001, 1.0, 3.0])
-def test_the_derivative_turns_by_the_left_jacobian(theta):
-    """exp(ω + δ) = exp(J δ) exp(ω) to first order, and J is what multiplies the translation."""
-    omega = theta * double(2 / 3, -1 / 3, 2 / 3)
-    J = torch.stack([se3.exp(torch.cat((omega, e))[None]).t[0] for e in torch.eye(3, dtype=torch.float64)], -1)
-    slope = torch.func.jacrev(lambda w: se3.exp(torch.cat((w, 0 * w))[None]).R[0])(omega)
-    R = se3.exp(torch.cat((omega, 0 * omega))[None]).R[0]
-    for k in range(3):
-        torch.testing.assert_close(slope[..., k], cross_matrix(J[:, k]) @ R, rtol=0, atol=3e-13)
-
-
 def test_gradients_at_zero_are_exact_up_to_the_second():
     zero, eye = torch.zeros(6, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     G = torch.stack([cross_matrix(e) for e in eye])  # generators of rotations

@@ -53,18 +53,6 @@ def test_held_out_frames_are_neither_labelled_nor_source_views(study):
             assert views and set(views) <= set(training) - {i}
 
 
-@pytest.mark.slow
-def test_labels_hold_near_returns_and_far_answers_and_no_hidden_return(study, labelled):
-    lessons, tests = (collate(part) for part in labelled)
-    near, sensed = study.scenes[0].near, (lessons.depth > 0) & ~lessons.recovered
-    assert sensed.any() and (lessons.depth[sensed] <= near).all()
-    assert not tests.recovered.any() and (tests.depth <= near).all() and tests.far.any()
-    answered = lessons.recovered & lessons.far
-    error = ((lessons.depth - lessons.truth).abs() / lessons.truth)[answered]
-    assert answered.sum() > 50 and error.median() < 0.2
-    assert (lessons.truth[answered] > near).all()
-
-
 def test_every_variant_has_its_own_labels(labelled):
     labels = collate(labelled[0])
     depth, sigma = {}, {}
@@ -88,16 +76,6 @@ def test_far_labels_teach_what_near_ones_do_not():
         errors[variant] = torch.tensor(far_labels.frame_errors(network, frames)).mean(0)
     assert errors["far"][0] < 0.15 < 0.3 < errors["near"][0]
     assert errors["near"][1] < 0.15 and errors["far"][1] < 0.15
-
-
-def test_ratios_to_near_alone():
-    near = torch.tensor([[[0.4, 0.1], [0.2, 0.1]]]).expand(2, -1, -1)
-    summary = far_labels.compare({"near": near, "far": near * torch.tensor([0.5, 1.0])})
-    assert summary["far.far_ratio"]["value"] == pytest.approx(0.5) == summary["far.far_ratio"]["high"]
-    assert summary["far.far_ratio_of_seeds"] == pytest.approx([0.5, 0.5])
-    assert summary["far.near_ratio"]["value"] == pytest.approx(1)
-    assert summary["near.far_error"]["value"] == pytest.approx(0.3)
-    assert summary["near.far_error"]["low"] == pytest.approx(0.2)
 
 
 def test_the_far_labels_script(monkeypatch, tmp_path, study, labelled, capsys):

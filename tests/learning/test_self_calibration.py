@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from dhtorch.geometry import se3
-from dhtorch.geometry.se3 import Pose
 from dhtorch.synthetic import SyntheticRoom
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks" / "learning"))
@@ -42,18 +40,6 @@ def test_planted_errors_are_those_that_calibration_removes(capture):
     torch.testing.assert_close(calibration.vector(), torch.tensor([0.05, 0.08, 0.0]))
 
 
-def test_poses_between_frames_lie_on_the_geodesic(capture):
-    world = capture.T_world_from_cam
-    k = torch.tensor([0.0, 3.0, 7.0, 2.25], dtype=torch.float64, requires_grad=True)
-    poses = example.poses_at(world, k)
-    torch.testing.assert_close(poses.R[:3], world.R[[0, 3, 7]])
-    torch.testing.assert_close(poses.t[:3], world.t[[0, 3, 7]])
-    a, b, between = (Pose(p.R[i : i + 1], p.t[i : i + 1]) for p, i in ((world, 2), (world, 3), (poses, 3)))
-    whole, part = (se3.log(se3.relative(end, a)) for end in (b, between))
-    torch.testing.assert_close(part, 0.25 * whole)
-    assert torch.autograd.gradcheck(lambda k: example.poses_at(world, k).t, k.detach()[3:].requires_grad_())
-
-
 def test_depth_of_a_slanted_surface_has_its_slope_as_gradient_and_edges_have_no_depth():
     x = torch.arange(160.0)
     plane = (2 + 0.01 * x).expand(1, 120, 160).clone()
@@ -66,20 +52,3 @@ def test_depth_of_a_slanted_surface_has_its_slope_as_gradient_and_edges_have_no_
     torch.testing.assert_close(depth[:, :2], 2 + 0.01 * uv[:, :2, 0], atol=1e-4, rtol=0)
     depth[:, :2].sum().backward()
     torch.testing.assert_close(uv.grad[:, :2], torch.tensor([[[0.01, 0.0]] * 2]), atol=1e-4, rtol=0)
-
-
-def test_every_pair_comes_before_one_comes_again():
-    draws = example.draw_pairs(7, 3, torch.Generator().manual_seed(0))
-    drawn = torch.cat([next(draws) for _ in range(7)])
-    assert all(sorted(drawn[7 * i : 7 * i + 7].tolist()) == list(range(7)) for i in range(3))
-
-
-def test_recovered_is_what_the_planted_run_has_beyond_the_other():
-    as_it_is = {"focal": 0.01, "scale": -0.002, "offset": 0.1}
-    planted = {"focal": 1.01 * 1.05 - 1, "scale": 0.998 * 1.08 - 1, "offset": 1.1}
-    assert example.recovered_errors(planted, as_it_is) == pytest.approx(example.PLANTED)
-
-
-def test_a_capture_needs_poses_and_registered_depth():
-    with pytest.raises(ValueError, match="expected poses, and depth at the pixels"):
-        example.load_capture(SyntheticRoom(n_frames=1, hw=(60, 80)))

@@ -522,7 +522,8 @@ def equations(turning):
         normal, cost = reprojection_problem.pose_normal_equations_at(problem, noise, *weights, **robust)
         normal(at), cost(at)
         if dtype == torch.float32:
-            reprojection_problem.squared_residuals_at(problem, at)(noise)
+            known = reprojection_problem.track_constants(problem)
+            reprojection_problem.squared_residuals_at(problem, at, known)(noise)
             for steps, rotation_only in ((0, False), (1, True), (4, False), (4, True)):
                 reprojection_problem.minimise_tracks(
                     problem, at, noise, *weights, steps=steps, rotation_only=rotation_only, **robust

@@ -10,7 +10,6 @@ from dhtorch.codes import Flag
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera, Frame
 from dhtorch.stages.backproject import backproject
-from dhtorch.stages.holes import classify
 
 HW, DEPTH_HW = (40, 56), (20, 28)
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -298,18 +297,3 @@ def test_a_pixel_outside_of_the_lens_model_has_no_point():
     assert found.depth.tolist() == [[1.5, 1.5]]
     ray = cam.undistort(lens, uv[None])[0, 0] - 8
     torch.testing.assert_close(found.xyz[0, 0], torch.tensor([*(1.5 * ray / 30).tolist(), 1.5]))
-
-
-def test_only_pixels_around_the_samples_are_read():
-    """Others may hold anything without changing the answer; also a depth map with a camera of its own is read."""
-    frame, uv = frames(HW)[:1], torch.tensor([[[20.0, 20.0], [24.0, 22.0]]], dtype=torch.float64)
-    near = torch.zeros(HW, dtype=torch.bool)
-    near[11:33, 11:34] = True
-    other = frame.replace(image=frame.image.where(near, torch.nan), depth=frame.depth.where(near, torch.nan))
-    one, two = (classify(f, backproject(f, uv)) for f in (frame, other))
-    for name in ("trackability", "xyz", "flag", "hole", "confidence"):
-        torch.testing.assert_close(getattr(one, name), getattr(two, name), rtol=0, atol=0, equal_nan=True)
-    own = cam.resize(frame.camera, HW, HW)
-    assert torch.equal(backproject(frame.replace(depth_camera=own), uv).depth, one.depth)
-    wide = backproject(frame.replace(depth_camera=own.replace(f=5 * own.f)), uv)  # sees less than the samples
-    assert (wide.depth == 0).all() and ((wide.flag & Flag.NO_DEPTH) != 0).all()

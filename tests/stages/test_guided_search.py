@@ -70,13 +70,6 @@ def test_returns_are_predicted_by_the_pose_alone():
     assert not found.unique[near].any()
 
 
-def test_a_pose_that_is_not_finite_predicts_nothing():
-    samples, whole, other, T, _, _ = orbit_case(15)
-    found = search(samples, whole, other, T.map(lambda x: x * torch.nan))
-    assert not found.uv_1.isfinite().any()
-    assert not found.unique.any()
-
-
 def test_only_wanted_samples_are_searched_and_their_matches_are_those_of_all():
     samples, whole, other, T, _, _ = orbit_case(15)
     wanted = torch.arange(512)[None] % 3 == 0
@@ -144,11 +137,3 @@ def test_the_stated_variance_grows_with_the_noise_of_the_pictures():
     both = found.unique & noisy.unique
     assert both.sum() > 10
     assert noisy.cov[0][both][:, 0, 0].median() > 2 * found.cov[0][both][:, 0, 0].median()
-
-
-def test_wrong_shapes_and_options_raise():
-    samples, whole, other, T, _, _ = orbit_case(15)
-    with pytest.raises(ValueError, match="hypotheses is 2"):
-        search(samples, whole, other, T, hypotheses=2)
-    with pytest.raises(ValueError, match="wanted"):
-        search(samples, whole, other, T, wanted=torch.ones(1, 3, dtype=torch.bool))

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.codes import Flag, Hole, Route
+from dhtorch.codes import Flag, Hole
 from dhtorch.records import Camera, Frame, Samples
-from dhtorch.stages.holes import classify, min_eigenvalue, suggest_route
+from dhtorch.stages.holes import classify, min_eigenvalue
 
 HW = (24, 32)
 GREY = np.array([0.299, 0.587, 0.114])
@@ -119,21 +119,6 @@ def test_texture_is_asked_for_a_hundred_thousandth_by_default():
     for wanted, hole in ((1.01e-5, Hole.TRACKABLE_NO_LIDAR), (0.99e-5, Hole.LOW_TEXTURE)):
         faint = frame.replace(image=frame.image * (wanted / texture) ** 0.5)
         assert classify(faint, samples).hole.item() == hole
-
-
-def test_what_to_try_for_each_hole():
-    table = {
-        Hole.NONE: Route.NOTHING,
-        Hole.TRACKABLE_NO_LIDAR: Route.TRIANGULATE,
-        Hole.LOW_TEXTURE: Route.GET_CLOSER,
-        Hole.TOO_BRIGHT: Route.CHANGE_EXPOSURE,
-        Hole.TOO_DARK: Route.CHANGE_EXPOSURE,
-        Hole.HIGHLIGHT: Route.NOTHING,
-        Hole.AT_BORDER: Route.TURN_HEAD,
-    }
-    hole = torch.tensor([[*table], [*reversed(table)]], dtype=torch.int32)
-    assert suggest_route(hole).tolist() == [[*table.values()], [*reversed(table.values())]]
-    assert suggest_route(hole).dtype == torch.int32
 
 
 @pytest.mark.parametrize("missing", [[0, 1, 2], [0, 1], [1]])

@@ -7,12 +7,12 @@ from support.rooms import room
 from support.textures import waves
 from torch.autograd import gradcheck
 
-from dhtorch import KORNIA, PAPER, pytree
+from dhtorch import KORNIA, PAPER
 from dhtorch.codes import Flag, Gate, PoseCode
 from dhtorch.geometry.camera import resize
 from dhtorch.metrics import holdout
 from dhtorch.pipeline.pair import uniform_draws
-from dhtorch.records import Camera, Frame, Pose, TrackHint
+from dhtorch.records import Camera, Frame, Pose
 from dhtorch.stages.kornia.backproject import backproject_kornia
 from dhtorch.stages.kornia.holes import classify_kornia
 from dhtorch.stages.kornia.pose import pnp_ransac_kornia
@@ -95,17 +95,6 @@ def test_returns_of_sparse_maps_confidence_and_a_lens_are_read_as_by_paper(own_c
     )
     returns = Flag.NO_DEPTH | Flag.LOW_CONF | Flag.BEYOND_NEAR | Flag.BORDER
     assert torch.equal(kornia.flag & returns, paper.flag & returns)
-
-
-def test_a_return_at_the_limit_is_used_and_texture_is_that_of_the_nearest_pixel():
-    draw = torch.Generator().manual_seed(0)
-    camera = Camera(torch.full((1, 2), 30.0), torch.tensor([[15.5, 11.5]]))
-    frame = Frame(torch.rand(1, 1, 24, 32, generator=draw), torch.full((1, 24, 32), 1.5), camera)
-    uv = torch.tensor([[10.0, 12.0], [10.4, 11.7], [10.6, 12.2], [11.0, 12.0]])
-    samples = classify_kornia(frame, backproject_kornia(frame, uv, near_limit=1.5))
-    assert samples.usable.all() and not backproject_kornia(frame, uv, near_limit=1.499).usable.any()
-    first, same, other, next_one = samples.trackability[0].tolist()
-    assert first == same != other == next_one
 
 
 def test_tracks_are_those_of_paper(both):
@@ -230,22 +219,6 @@ def test_a_pair_without_a_pose_has_papers_code():
     assert torch.equal(*codes) and codes[1].tolist() == [PoseCode.OK, PoseCode.DEGENERATE, *[PoseCode.TOO_FEW] * 2, 0]
 
 
-def test_hopeless_pairs_have_no_answer_and_finite_gradients(pair):
-    """A blank picture, no depth, and a source picture of something else, in one batch."""
-    draw = torch.Generator().manual_seed(0)
-    blank = pair[0].replace(image=torch.full_like(pair[0].image, 0.5))
-    blind = pair[0].replace(depth=torch.full_like(pair[0].depth, torch.nan))
-    other = pair[1].replace(image=torch.rand(pair[1].image.shape, generator=draw))
-    frames = pytree.collate([blank, blind, pair[0]]), pytree.collate([pair[1], pair[1], other])
-    images = [f.image.clone().requires_grad_() for f in frames]
-    estimate = KORNIA(*(f.replace(image=image) for f, image in zip(frames, images, strict=True)), n=128)
-    assert not estimate.keep.any() and not estimate.score.any()
-    total = estimate.parallax_deg.sum() + estimate.residual_px.nan_to_num(0, 0, 0).sum()
-    if total.requires_grad:
-        for gradient in torch.autograd.grad(total, images, allow_unused=True):
-            assert gradient is None or gradient.isfinite().all()
-
-
 def test_points_outside_the_picture_stay_where_the_search_would_begin():
     image_0, image_1, uv = shifted(2, 6, D)
     uv[0, 0], uv[0, 1], uv[1, 2] = torch.tensor([-40.0, 10.0]), torch.nan, torch.tensor([torch.inf, 5.0])
@@ -254,13 +227,3 @@ def test_points_outside_the_picture_stay_where_the_search_would_begin():
     assert not kornia.valid[outside].any() and kornia.valid[~outside].float().mean() > 0.5
     assert torch.equal(kornia.uv_1[outside], paper.uv_1[outside])
     assert all(x.isfinite().all() for x in (kornia.uv_1, kornia.error, kornia.photometric, kornia.cov))
-
-
-def test_a_hinted_start_reaches_a_motion_beyond_the_pyramid():
-    image_0, image_1, uv = shifted(2, 20, torch.float32)
-    far = torch.roll(image_1, (12, 12), (-2, -1))
-    options = {"window": 9, "levels": 1}
-    lost = lucas_kanade_kornia(image_0, far, uv, **options)
-    hint = PAPER.track(image_0, image_1, uv, **options)
-    tracks = lucas_kanade_kornia(image_0, far, uv, hint=TrackHint(start=hint.uv_1 + 12), **options)
-    assert tracks.valid.float().mean() > lost.valid.float().mean() + 0.3

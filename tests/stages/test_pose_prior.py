@@ -1,6 +1,5 @@
 """Poses from elsewhere: held against near returns, in sigma, in samples; what a wrong one is called."""
 
-import warnings
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +13,7 @@ from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, InitialPose, Pose, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 from dhtorch.stages import pose_prior
 from dhtorch.stages.pose_prior import check_pose_prior, make_prior
 from dhtorch.synthetic import SyntheticRoom
@@ -143,22 +142,6 @@ def test_poses_of_the_camera_read_as_poses_of_the_world_are_named(pairs):
     assert {conventions.CONVENTIONS[i] for i in fit.matched_convention.tolist()} == {"the inverse"}
 
 
-def test_a_nonsense_pose_is_refuted_without_a_name(pairs):
-    T = off_by(se3.relative(*pairs[3]), (0.5, 0.5))
-    _, fit, *_ = asked(pairs, pose_prior.make_prior(T), "paper")
-    assert (fit.code == PoseCode.REFUTED).all() and (fit.matched_convention == 0).all()
-
-
-def test_one_wrong_pose_of_a_batch_silences_its_pair_alone(pairs):
-    T = se3.relative(*pairs[3])
-    mixed = T.replace(t=torch.where(torch.tensor([[False], [True], [False]]), -T.t, T.t))
-    estimate, fit, *_ = asked(pairs, pose_prior.make_prior(mixed))
-    assert fit.ok.tolist() == [True, False, True]
-    alone = asked(tuple(x[2:] if k < 3 else x for k, x in enumerate(pairs)), pose_prior.make_prior(mixed[2:]))[0]
-    assert torch.equal(alone.gate[0], estimate.gate[2])
-    assert fit.inlier.any(1).tolist() == [True, False, True]
-
-
 def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name():
     """Twice the motion, the wrong way round: read as the inverse it fits what is far away, and that is not enough."""
     camera = Camera(torch.tensor([[500.0, 500.0]]), torch.tensor([[320.0, 240.0]]))
@@ -177,28 +160,6 @@ def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name
         assert found[-1].code.tolist() == [PoseCode.REFUTED] and not found[-1].inlier.any()
     assert int(found[0].matched_convention) == 0 and int(found[1].n_inlier) == 21
     assert conventions.CONVENTIONS[int(found[2].matched_convention)] == "the inverse"
-
-
-def test_refining_starts_from_the_given_pose(pairs):
-    T = se3.relative(*pairs[3])
-    rough = off_by(T, (0.003, 0.006), seed=1)
-    _, fit, *_ = asked(pairs, pose_prior.make_prior(rough, refine=True))
-    assert (
-        isinstance(pose_prior.make_prior(rough, refine=True), InitialPose) and fit.ok.all() and fit.shutter is not None
-    )
-    distance = lambda A: (A.t.double() - T.t).norm(dim=-1)  # noqa: E731
-    assert (distance(fit.T_1_from_0) < distance(rough)).all()
-    _, refuted, *_ = asked(pairs, pose_prior.make_prior(se3.invert(T), refine=True))
-    assert (refuted.code == PoseCode.REFUTED).all() and (refuted.matched_convention > 0).all()
-
-
-def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
-    _, fit, *_ = asked(pairs, pose_prior.make_prior(se3.relative(*pairs[3]), refine=True))
-    codes = torch.tensor([PoseCode.REFUTED, PoseCode.OK, PoseCode.TOO_FEW])
-    left = pose_prior.reject_poses(fit, fit.replace(code=codes))
-    assert left.code.tolist() == codes.tolist() and left.ok.tolist() == [False, True, False]
-    assert left.T_1_from_0.t.isnan().all(1).tolist() == [True, False, True] and not left.inlier[0].any()
-    assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.shutter_rate[2].isnan().all()
 
 
 def test_a_pose_without_translation_or_unknown_is_not_used(pairs):
@@ -339,25 +300,6 @@ def test_what_is_no_pose_is_refused(sample, change, said):
     assert not blank["dhtorch.valid"].any() and blank["dhtorch.pose_convention"] == 0
 
 
-def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
-    _, fit, *_ = asked(pairs, pose_prior.make_prior(se3.relative(*pairs[3])))
-    wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
-    both = [wrong.replace(matched_convention=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
-    with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
-        paired = torch.tensor([True, True, False])
-        found = poses.match_refuted_poses([fit, *both], paired)
-        poses.warn_refuted_poses([fit, *both], paired, found, "camera")
-    assert found.tolist() == [4, 3, 0]
-
-
-def test_a_pose_that_is_not_known_leaves_a_hole(sample):
-    sample["pose"] = sample["pose"] * torch.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        out = transform()(sample)
-    assert not out["dhtorch.pose_ok"] and (out["dhtorch.gate"] == Gate.NO_POSE).any()
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -381,17 +323,6 @@ def test_a_gap_brings_the_pose_along():
     data = ExtendedDataset(items, transform(), gap=GAP)
     assert data[GAP]["dhtorch.pose_ok"] and not {"before", "pose_before"} & data[GAP].keys()
     assert not data[1]["dhtorch.pose_ok"] and data[1]["dhtorch.gate"].unique().tolist() == [Gate.NO_TRACK]
-
-
-def test_maps_are_swept_under_the_given_pose(sample):
-    out = transform(method="paper", dense={"size": 56, "planes": 24, "source_views": 1})(sample)
-    T = se3.relative(room().true_poses[GAP : GAP + 1], room().true_poses[:1])
-    assert torch.allclose(out["dhtorch.T_1_from_0"][:3, 3], T.t[0].float(), atol=1e-5)
-    sample["pose"] = torch.linalg.inv(torch.as_tensor(sample["pose"]))
-    with pytest.warns(UserWarning, match="contradict"):
-        out = transform(method="paper", dense={"size": 56, "planes": 24, "source_views": 1})(sample)
-    silent = out["dhtorch.gate_map"][out["dhtorch.source_map"] == 0]
-    assert (silent == Gate.POSE_REFUTED).all()
 
 
 @pytest.mark.parametrize(("deviation", "refuted"), [(0.9, False), (1.1, True)])

@@ -59,20 +59,6 @@ def test_the_spiral_is_its_formula(options, n):
     np.testing.assert_allclose(found.numpy(), plain_spiral((60, 80), n, **options), atol=1e-9)
 
 
-@pytest.mark.parametrize("foveation", [0.5, 1.3])
-def test_spacing_along_an_arm_is_that_between_arms(foveation):
-    """What the default number of turns is for. With steps of angle and radius from point to point of an arm, the way
-    is r Δθ, and after half a turn the other arm passes at a distance of π Δr / Δθ; radii in shares of the border's."""
-    hw, n = (600, 800), 3000
-    low, high, middle = box(hw, 0.0)
-    uv = spiral(hw, n, foveation=foveation, margin_px=0, inner_px=0, dtype=torch.float64)[0::2].numpy() - middle
-    angle = np.unwrap(np.arctan2(uv[:, 1], uv[:, 0]))
-    radius = np.hypot(*uv.T) / [to_border(middle, x, low, high) for x in angle]
-    some = slice(300, 1400)
-    step, out = np.diff(angle)[some], np.diff(radius)[some]
-    np.testing.assert_allclose(radius[some] * step, math.pi * out / step, rtol=5e-3)
-
-
 @pytest.mark.parametrize(("gaze", "margin_px", "n"), [(None, 2.0, 30), ((15.0, 40.0), 5.0, 31)])
 def test_vogels_sunflower_is_its_formula(gaze, margin_px, n):
     low, high, middle = box((60, 80), margin_px)
@@ -119,13 +105,6 @@ def test_defaults_and_single_samples(sampler):
     reach = 0.0 if sampler is regular_grid else 0.5**0.5  # of the way to the border
     one = plain_spiral((50, 90), 1)[0] if sampler is spiral else (44.5 + reach * 42.5, 24.5)
     assert sampler((50, 90), 1, dtype=torch.float64)[0].tolist() == pytest.approx(list(one))
-
-
-@pytest.mark.parametrize("gaze", [(2.0, 2.0), (87.0, 47.0)])
-@pytest.mark.parametrize("sampler", [spiral, vogel_spiral])
-def test_the_gaze_may_lie_on_the_margin(sampler, gaze):
-    uv = sampler((50, 90), 9, gaze=gaze)
-    assert uv.amin(0).tolist() >= [2.0, 2.0] and (uv <= torch.tensor([87.0, 47.0])).all()
 
 
 @pytest.mark.parametrize(

@@ -166,24 +166,6 @@ def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(stage):
     assert torch.equal(strict.gate[~plain.keep], plain.gate[~plain.keep]), "a reason stays the first one"
 
 
-def test_no_error_is_expected_below_a_millionth_nor_told_apart_above_a_million():
-    """And the own part of sigma is at least a thousandth of it, however large the pose's part."""
-    parts = answers()
-    estimate, tracks = parts[0], parts[2]
-    depth, sigma, shared = (x.clone() for x in (estimate.depth, estimate.sigma, estimate.sigma_shared))
-    error = 0 * tracks.error
-    residual = 0 * estimate.residual_px
-    depth[0, :5] = 2.0
-    sigma[0, :5] = torch.tensor([0.0, 0.2, 0.2, 1e-7, 1e9])
-    shared[0, :5] = torch.tensor([0.0, 0.2, 0.5, 0.0, 0.0])
-    residual[0, 0] = 1e12
-    changed = estimate.replace(depth=depth, sigma=sigma, sigma_shared=shared, residual_px=residual)
-    found = confidence_from_error(changed, parts[1], tracks.replace(error=error), parts[3]).score[0, :5]
-    e = 0.1 / found - 0.1
-    expected = torch.tensor([1.0, 0.1 * 1e-3, 0.1 * 1e-3, 1e-6, 1e6]).double()
-    torch.testing.assert_close(e, expected, rtol=1e-6, atol=1e-13)
-
-
 def test_where_no_error_can_be_stated_the_score_is_zero():
     estimate, samples, tracks, fit = answers()
     broken = {
@@ -241,40 +223,6 @@ def test_evidence_is_the_logarithm_of_what_it_is_called():
     assert [*columns] == [*SCORE_FEATURES]
     for k, (name, expected) in enumerate(columns.items()):
         np.testing.assert_allclose(x[..., k][stated].numpy(), np.log(expected)[stated], rtol=1e-9, err_msg=name)
-
-
-def test_evidence_is_not_told_apart_beyond_its_limits():
-    limits = {
-        "expected_error": (1e-5, 1e2),
-        "shared_error": (1e-5, 1e2),
-        "parallax_deg": (1e-3, 1e2),
-        "residual_px": (1e-2, 1e2),
-        "round_trip_px": (1e-3, 1e2),
-        "photometric": (1e-4, 1.0),
-        "trackability": (1e-7, 1.0),
-        "reach": (1e-2, 1e2),
-    }
-    estimate, samples, tracks, fit = answers()
-    for end, value in enumerate((1e-12, 1e12)):
-        x = torch.full((B, N), value, dtype=torch.float64)
-        extreme = estimate.replace(sigma=4 * x, sigma_shared=2 * x, parallax_deg=x, residual_px=x)
-        extreme = extreme.replace(depth=x if end else estimate.depth, sigma=(4 * x * x if end else 4 * x))
-        extreme = extreme.replace(sigma_shared=2 * x * x if end else 2 * x)
-        stage = samples.replace(trackability=x), tracks.replace(error=x, photometric=x), fit
-        found, stated = score_features(extreme, *stage)
-        rows = found[stated].exp()
-        for k, name in enumerate(SCORE_FEATURES):
-            if name != "reach" or end:
-                np.testing.assert_allclose(rows[:, k].numpy(), limits[name][end], rtol=1e-9, err_msg=name)
-    near = samples.replace(depth=samples.depth * 1e9)
-    found, stated = score_features(estimate, near, tracks, fit)
-    np.testing.assert_allclose(found[..., 7][stated].exp().numpy(), 1e-2)
-
-
-def test_without_returns_that_hold_the_pose_the_reach_is_the_depth_itself():
-    estimate, samples, tracks, fit = answers()
-    found, stated = score_features(estimate, samples, tracks, fit.replace(inlier=torch.zeros_like(fit.inlier)))
-    torch.testing.assert_close(found[..., 7].exp()[stated], estimate.depth[stated])
 
 
 def test_evidence_is_nothing_where_any_of_it_is_no_number():

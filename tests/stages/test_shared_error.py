@@ -187,23 +187,6 @@ def test_gradients_stay_finite_beside_unanswered_points_and_views():
     assert parallax.grad.isfinite().all() and (parallax.grad[0] < 0).all() and (parallax.grad[1] == 0).all()
 
 
-def test_gradients_stay_finite_without_a_turn():
-    samples, tracks, fits, estimates = views(turn=0.0)
-    shared = torch.zeros_like(estimates.sigma_shared).requires_grad_()
-    verified = verify_views(samples, tracks, fits, estimates.replace(sigma_shared=shared))
-    assert verified.keep.all()
-    verified.sigma_shared.sum().backward()
-    assert shared.grad.isfinite().all()
-
-
-def test_wrong_shapes_are_refused():
-    samples, tracks, fits, estimates = views()
-    with pytest.raises(ValueError, match="verify_views"):
-        verify_views(samples, tracks, fits, estimates[0])
-    with pytest.raises(ValueError, match="verify_views"):
-        verify_views(samples, tracks[:1], fits, estimates)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stress", "gate", "positions"),

@@ -5,7 +5,6 @@ from functools import partial
 import pytest
 import torch
 
-from dhtorch.pipeline.pair import track_in_chunks
 from dhtorch.pipeline.presets import KORNIA, MAP, PAPER, PAPER_DIRECT
 from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages.kornia.track import lucas_kanade_kornia
@@ -78,48 +77,6 @@ def test_without_images_between_it_is_the_tracker_bit_for_bit(track, hint):
     hint = TrackHint(start, levels=2, **hint)
     chain = track_chain(images[0], images[-1], uv, track=track, hint=hint, **options)
     assert all(torch.equal(getattr(plain, name), getattr(chain, name)) for name in FIELDS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_kornia])
-def test_drift_does_not_add_up_with_the_number_of_hops(track):
-    def spread(hops, register):
-        images = sequence(hops, noise=0.04)
-        chain = through(images, points(30), track, between=hops - 1, register=register, levels=2)
-        return float(distance(chain)[chain.valid].square().mean().sqrt())
-
-    assert max(spread(5, True), spread(15, True)) < 0.01
-    assert spread(15, False) > 1.4 * spread(5, False) > 0.04
-
-
-def test_registered_tracks_are_those_of_the_tracker_from_there():
-    images, uv = sequence(5), points()
-    chain = through(images, uv, levels=2)
-    direct = lucas_kanade(images[0], images[-1], uv, levels=2, hint=TrackHint(uv + MOTION))
-    assert chain.valid.all() and direct.valid.all()
-    assert (chain.uv_1 - direct.uv_1).abs().max() < 0.01
-    torch.testing.assert_close(chain.cov, direct.cov, rtol=0.02, atol=0)
-
-
-def test_a_bad_image_between_takes_little_away():
-    images, uv = [texture(MOTION * k / 20) for k in range(5)], points()
-    images[2] = torch.rand(images[2].shape, generator=torch.Generator().manual_seed(5), dtype=images[2].dtype)
-    jump, chain = lucas_kanade(images[0], images[-1], uv, levels=1), through(images, uv, levels=1)
-    away = (jump.uv_1 - uv - MOTION / 5).norm(dim=-1)
-    assert jump.valid.double().mean() > 0.9 and away[jump.valid].max() < 0.1
-    assert (
-        chain.valid[jump.valid].double().mean() > 0.9
-        and (chain.uv_1 - jump.uv_1)[chain.valid & jump.valid].abs().max() < 0.1
-    )
-    assert not through(images, uv, levels=1, register=False).valid.any()
-
-
-def test_the_jump_is_taken_from_the_hinted_start():
-    images, uv = sequence(4), points()
-    images[2] = torch.zeros_like(images[2])
-    hint = TrackHint(uv + MOTION + 1, between=images[1:-1])
-    chain = track_chain(images[0], images[-1], uv, track=lucas_kanade, levels=1, hint=hint)
-    assert right(chain) > 0.95 and right(through(images, uv, levels=1)) < 0.1
 
 
 # --- rules, on trackers whose every answer is known ------------------------------------------------------------------
@@ -265,18 +222,3 @@ def test_gradient_is_that_of_the_tracker(track, register):
     (expected,) = torch.autograd.grad(once.uv_1[..., 0].sum(), last)
     torch.testing.assert_close(by_image, expected, rtol=0.02, atol=0.02 * float(expected.abs().max()))
     assert not any(getattr(chain, name).requires_grad for name in ("error", "photometric", "cov"))
-
-
-@pytest.mark.slow
-def test_chunks_of_pairs_have_their_own_images():
-    images, uv = sequence(4), points(9)
-    other = [image.flip(-1) for image in images]
-    rows = [images if k % 3 else other for k in range(10)]
-    batch = [torch.cat([row[k] for row in rows]) for k in range(5)]
-    for between in (batch[1:-1], torch.stack(batch[1:-1])):
-        together = track_in_chunks(
-            PAPER, batch[0], batch[-1], uv.expand(10, -1, -1), TrackHint(levels=2, between=between)
-        )
-        for k in (0, 1, 9):
-            alone = through(rows[k], uv, levels=2)
-            assert all(torch.equal(getattr(together, f)[k], getattr(alone, f)[0]) for f in FIELDS)

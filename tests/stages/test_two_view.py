@@ -205,27 +205,6 @@ def test_a_rolling_shutter_counts_with_all_correlations_of_rotation_translation_
     torch.testing.assert_close(estimate.depth, depth)
 
 
-def test_a_rolling_shutter_is_undone_before_the_rays_meet():
-    """Each row of view 1 is turned by y · turn more; the pair whose pose is not ok is not touched by its turn."""
-    samples, tracks, fit, depth = stage(noise_px=0.0)
-    turn = torch.tensor([[0.016, -0.008, 0.012], [-0.012, 0.004, 0.008], [torch.nan] * 3]).double()
-    code = torch.tensor([PoseCode.OK, PoseCode.OK, PoseCode.TOO_FEW], dtype=torch.int32)
-    y = (tracks.uv_0[..., 1] - CAMERA_0.c[:, 1:]) / CAMERA_0.f[:, 1:]
-    seen = se3.apply(fit.T_1_from_0, cam.unproject(CAMERA_0, tracks.uv_0, depth))
-    for b in range(2):
-        for k in range(N):
-            seen[b, k] = torch.linalg.matrix_exp(se3.hat(y[b, k] * turn[b])) @ seen[b, k]
-    uv_1 = cam.project(CAMERA_1, seen).requires_grad_()
-    shutter = Shutter(turn, torch.zeros(B, 9, 9, dtype=torch.float64))
-    estimate = ask(samples, tracks.replace(uv_1=uv_1), fit.replace(shutter=shutter, code=code))
-    as_if_not = ask(samples, tracks.replace(uv_1=uv_1.detach()), fit)
-    off, far_off = (((x.depth.detach() - depth).abs() / depth)[:2].median() for x in (estimate, as_if_not))
-    assert off < 4e-5 and far_off > 100 * off
-    assert (estimate.gate[2] == Gate.NO_POSE).all()
-    estimate.depth[:2].sum().backward()
-    assert uv_1.grad.isfinite().all()
-
-
 # ---------------------------------------------------------------------------------------------------- gates
 
 

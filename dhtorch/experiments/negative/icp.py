@@ -38,7 +38,7 @@ from dhtorch.experiments.protocol import (
 )
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.least_squares import gauss_newton_step, select_batch
+from dhtorch.geometry.least_squares import move_pose, select_batch, solve_spd
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.metrics import bootstrap
 from dhtorch.pytree import Record, record
@@ -124,7 +124,7 @@ def register_icp(
         reach = reach_m
         for _ in range(iterations):
             H, g, _, _ = sets.linearise(T, reach, keep)
-            T, _ = gauss_newton_step(T, H, g)
+            T = move_pose(T, solve_spd(H, -g[..., None])[0][..., 0])
             reach = max(reach * shrink, least_reach_m)
         H, _, matched, square = sets.linearise(T, least_reach_m, 1.0)
     n = matched.sum(-1)
