@@ -2,7 +2,7 @@
 
 A pair is a function of the seed and its number alone. The room is a box with three smaller boxes in it, painted with
 noise that is the same from both sides; depth is exact up to 1 % of noise and reaches 2 m. Then one kind of trouble is
-made. ``truth`` is what the reference view's pixels really show, NaN where a pair has no such thing.
+made. ``truth`` is what the reference view shows before.
 """
 
 import math
@@ -158,7 +158,6 @@ def _duplicated(pair: Pair) -> None:
 def _swapped(pair: Pair) -> None:
     """View 1 is called the reference view, with the depth of view 0."""
     pair.image_0, pair.image_1 = pair.image_1, pair.image_0
-    pair.truth = pair.room.view(se3.compose(pair.room.start, se3.invert(pair.motion)))[1]
 
 
 def _unrelated(pair: Pair) -> None:
@@ -227,11 +226,6 @@ def _lens(pair: Pair, scale: float) -> None:
     pair.lens = torch.tensor([pair.draw.gauss(0, scale) for _ in range(5)])
 
 
-def _scaled(pair: Pair, factor: float) -> None:
-    """Depth in another unit, truth with it."""
-    pair.depth, pair.truth = pair.depth * factor, pair.truth * factor
-
-
 def _lie(pair: Pair) -> None:
     """Returns that have nothing to do with the scene."""
     random = 0.3 + (NEAR - 0.3) * torch.rand(HW, generator=pair.g)
@@ -274,8 +268,8 @@ KINDS: dict[str, Callable[[Pair], None]] = {
     "infinite depth": lambda pair: _junk(pair, INF, -INF),
     "tiny, huge, negative depth": lambda pair: _junk(pair, -1.0, 1e-30, 1e-4, 1e30, 3e38),
     "random depth": _lie,
-    "depth in mm": lambda pair: _scaled(pair, 1e3),
-    "depth in light years": lambda pair: _scaled(pair, 1e-16),
+    "depth in mm": lambda pair: setattr(pair, "depth", 1e3 * pair.depth),
+    "depth in light years": lambda pair: setattr(pair, "depth", 1e-16 * pair.depth),
     "constant images": lambda pair: _blank(pair, 0.5),
     "black view 1": lambda pair: _blank(pair, 0.0, (1,)),
     "saturated": _saturated,

@@ -178,7 +178,8 @@ def measure(device: str, options: Any, rows: list[dict[str, Any]]) -> None:
     end = time.monotonic() + options.seconds
     one = Inputs()
     here: dict[str, tuple[list[float], Any]] = {}
-    for name, call in {**calls(CPU_BATCH, "cpu", one), **of_views(calls(1, "cpu", one))}.items():
+    alone = {name: call for name, call in calls(1, "cpu", one).items() if name in OF_VIEWS}
+    for name, call in (calls(CPU_BATCH, "cpu", one) | alone).items():
         size = 1 if name in OF_VIEWS else CPU_BATCH
         results: list[Any] = []
         spent = harness.in_turn([lambda call=call, results=results: results.append(call())], repeats=2, warm_up=0)[0]
@@ -214,11 +215,6 @@ def measure(device: str, options: Any, rows: list[dict[str, Any]]) -> None:
             if name in times and peer in times:
                 more = {"n": N, "batch": batch, "device": device}
                 rows.append(harness.row(f"gpu_{name}_b{batch}.kornia", times[name], "kornia", times[peer], **more))
-
-
-def of_views(calls: dict[str, Call]) -> dict[str, Call]:
-    """The calls of one reference view with several others."""
-    return {name: calls[name] for name in OF_VIEWS}
 
 
 def main() -> int:

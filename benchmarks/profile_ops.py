@@ -1,4 +1,4 @@
-"""The ten most expensive operations of a method or a stage, and how many there are.
+"""The ten most expensive operations of a method or a stage, in several calls, and how often each runs.
 
     python benchmarks/profile_ops.py                         method=paper, whole pair
     python benchmarks/profile_ops.py map --stage pose        one stage of a method
@@ -38,7 +38,7 @@ def seat_call(method: Method, name: str, frames: tuple[Any, Any], n: int) -> Cal
 
 
 def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
-    """Operations by the time they take themselves, per call."""
+    """Operations by the time they take themselves in all calls."""
     for _ in range(3):
         call()
     kinds = [ProfilerActivity.CPU] + ([ProfilerActivity.CUDA] if device != "cpu" else [])
@@ -46,14 +46,7 @@ def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
         for _ in range(repeats):
             call()
     key = "self_cpu_time_total" if device == "cpu" else "self_device_time_total"
-    events = sorted(profiler.key_averages(), key=lambda e: -getattr(e, key))
-    whole = sum(getattr(e, key) for e in events)
-    lines = [f"{'operation':36} {'us per call':>12} {'share':>7} {'count':>7}"]
-    for e in events[:top]:
-        took = getattr(e, key)
-        lines.append(f"{e.key[:36]:36} {took / repeats:12.1f} {took / whole:7.1%} {e.count / repeats:7.0f}")
-    count = sum(e.count for e in events if e.key.startswith("aten::"))
-    return "\n".join([*lines, f"{'all':36} {whole / repeats:12.1f} {1:7.1%} {count / repeats:7.0f}"])
+    return profiler.key_averages().table(sort_by=key, row_limit=top)
 
 
 def main() -> None:

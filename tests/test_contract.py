@@ -513,11 +513,11 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_errors.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
-    "dhtorch.geometry.inference_mode.run_without_grad",
+    "dhtorch.geometry.determinism.run_without_grad",
     "dhtorch.geometry.camera.check_lens",  # tests/geometry/test_camera.py, tests/ops/test_compiled.py
     # tests/geometry/test_motion_fit.py, tests/geometry/test_epipolar_motion.py, tests/measure
     *(f"dhtorch.geometry.motion_fit.{name}" for name in ("fit_motion", "mean_flow_form", "rotation_from_flow")),
-    *(f"dhtorch.geometry.{name}" for name in ("motion_fit.scene_flow", "epipolar_motion.fit_epipolar_motion")),
+    *(f"dhtorch.geometry.{name}" for name in ("motion_fit.scene_flow", "motion_fit.fit_epipolar_motion")),
     *(f"dhtorch.geometry.covariance.{name}" for name in ("chi2_quantile", "grouped_covariance")),
     *(f"dhtorch.metrics.change_points.{name}" for name in ("mean_changes", "median_of_three")),
     *(f"dhtorch.metrics.camera_paths.{name}" for name in ("align_camera_paths", "compare_motions", "motions_of_path")),
@@ -618,7 +618,7 @@ ELSEWHERE = {
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.fuse_consistent",
     "dhtorch.stages.shared_error.verify_views",
-    "dhtorch.geometry.free_space.free_space_violations",
+    "dhtorch.stages.triangulate.free_space_violations",
     *(
         f"dhtorch.pipeline.view_selection.{name}"
         for name in (

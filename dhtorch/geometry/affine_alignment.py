@@ -24,8 +24,7 @@ from torch import Tensor
 
 from dhtorch.geometry import linalg as closed_form
 from dhtorch.geometry.checks import any_possible, constant, is_static, shaped
-from dhtorch.geometry.determinism import MAX_CHUNK_POINTS, chunk_size
-from dhtorch.geometry.inference_mode import run_without_grad
+from dhtorch.geometry.determinism import MAX_CHUNK_POINTS, chunk_size, run_without_grad
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.linalg import matmul_planes, solve_cholesky
 from dhtorch.geometry.lucas_kanade import is_between, masked_apply
@@ -73,21 +72,15 @@ class AffineRegistration(NamedTuple):
     ok: Tensor  # (B, N) bool; where not, uv_1 is the start and linear the identity
 
 
-class _Options(NamedTuple):
-    """Options of the search; see :func:`register_affine`."""
-
-    window: int
-    steps: int
-    epsilon_px: float
-    max_shift_px: float
-
-
 class _Views(NamedTuple):
     """The pyramids of both images, and the options of the search."""
 
     source: Pyramid
     target: Pyramid
-    o: _Options
+    window: int
+    steps: int
+    epsilon_px: float
+    max_shift_px: float
 
 
 class _State(NamedTuple):
@@ -148,14 +141,14 @@ def register_affine(
         xy_0, xy_1, batch, usable = _flatten_points(source, target, uv_0, uv_1)
         if wanted is not None:
             usable = usable & wanted.reshape(-1)
-        views = _Views(source, target, _Options(window, iterations, epsilon_px, max_shift_px))
+        views = _Views(source, target, window, iterations, epsilon_px, max_shift_px)
         start_linear = _identity(xy_1)
         if linear is not None:
             start_linear = linear.to(xy_1).permute(2, 1, 0).repeat_interleave(N, -1)
         register = partial(_register, views)
-        fields = run_without_grad(
-            masked_apply, usable, register, _unregistered(xy_1), (xy_0, xy_1, start_linear, batch)
-        )
+        zero = torch.zeros_like(xy_1[0])
+        unregistered = xy_1, _identity(xy_1), zero, _identity(xy_1), zero, zero > 0
+        fields = run_without_grad(masked_apply, usable, register, unregistered, (xy_0, xy_1, start_linear, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
@@ -221,20 +214,20 @@ def _register(
     batch: Tensor,  # (M,)
 ) -> tuple[Tensor, ...]:
     """Points and start -> fields of an :class:`AffineRegistration`, points last."""
-    target, o = views.target, views.o
+    target, window = views.target, views.window
     q = round_half_up(xy_0)
-    point = _window_coordinates(xy_0 - q, o.window)
-    warp = _initial_warp(xy_1, point, start_linear, o.window)
+    point = _window_coordinates(xy_0 - q, window)
+    warp = _initial_warp(xy_1, point, start_linear, window)
     state = _search(views, 0, q, point, warp, batch)
     best = state._replace(warp=warp, quality=state.start_quality)
     if len(target.levels) > 1:
         # Magnification from which on image 1 is sampled on its half-size level, where neighbouring pixels of the
         # window are about a pixel apart again.
-        magnified = _determinant(_linear(state.warp, o.window)) > 1.5**2
+        magnified = _determinant(_linear(state.warp, window)) > 1.5**2
         state = _State(*masked_apply(magnified, partial(_search, views, 1), state, (q, point, state.warp, batch)))
     shift = ((state.warp * point[:, None]).sum(0) - xy_1).square().sum(0).sqrt()
-    shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
-    area_scale, gain = _determinant(_linear(state.warp, o.window)), state.quality[0]
+    shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, views.max_shift_px))
+    area_scale, gain = _determinant(_linear(state.warp, window)), state.quality[0]
     in_range = (
         (area_scale > REGISTRATION_SCALE_RANGE[0] ** 2)
         & (area_scale < REGISTRATION_SCALE_RANGE[1] ** 2)
@@ -244,12 +237,12 @@ def _register(
     # Residual noise variance at the end over that at the start, a ratio, above which a search has diverged.
     not_diverged = _noise(state.quality) <= 1.2 * _noise(best.quality)
     ok = (state.textured & in_range & not_diverged & is_between(state.warp[0], *target.bounds())) & (
-        shift <= o.max_shift_px
+        shift <= views.max_shift_px
     )
     best = _State(*(torch.where(ok, new, old) for new, old in zip(state, best, strict=True)))
     rms = best.quality[1].sqrt() / best.quality[0].clamp(*REGISTRATION_GAIN_RANGE)
-    A = _linear(best.warp, o.window).transpose(0, 1)
-    return (best.warp * point[:, None]).sum(0), A, rms, _covariance(best, point, o.window), shift, ok
+    A = _linear(best.warp, window).transpose(0, 1)
+    return (best.warp * point[:, None]).sum(0), A, rms, _covariance(best, point, window), shift, ok
 
 
 def _search(
@@ -265,12 +258,6 @@ def _search(
     return _register_level(*levels, q, point, warp, batch, views=views, level=level)
 
 
-def _reads_whole_windows(source: Tensor, *_: Tensor, views: _Views, level: int) -> bool:
-    """Whether the source has gradients, and every window, with its search range, lies within the padding."""
-    padding = min(views.source.pad, views.target.pad)
-    return source.shape[1] > GRAD_Y_PLANE and padding >= views.o.window // 2 + SEARCH_PADDING_PX
-
-
 def _register_level_kernel(
     source: Tensor,
     target: Tensor,
@@ -282,7 +269,7 @@ def _register_level_kernel(
     views: _Views,
     level: int,
 ) -> _State:
-    o, scale = views.o, 0.5**level
+    scale = 0.5**level
     textured = torch.empty_like(batch, dtype=torch.bool)
     registered_warp, fit, first = torch.empty_like(warp), torch.empty_like(point), torch.empty_like(point)
     inverse = warp.new_empty(2, 8, len(batch))
@@ -298,11 +285,11 @@ def _register_level_kernel(
         fit=fit,
         first=first,
         inverse=inverse,
-        window=o.window,
-        steps=o.steps,
+        window=views.window,
+        steps=views.steps,
         source_pad=views.source.pad,
         target_pad=views.target.pad,
-        epsilon=o.epsilon_px * scale,
+        epsilon=views.epsilon_px * scale,
         search_padding=SEARCH_PADDING_PX,
         margin=OUTSIDE_MARGIN_PX,
         max_extrapolation=MAX_EXTRAPOLATION,
@@ -317,7 +304,11 @@ def _register_level_kernel(
 @operator(
     kernel=_register_level_kernel,
     dtypes=dict.fromkeys(("source", "target", "q", "point", "warp"), torch.float32) | {"batch": torch.int64},
-    when=_reads_whole_windows,
+    # The source has gradients, and every window, with its search range, lies within the padding.
+    when=lambda source, *_, views, level: (
+        source.shape[1] > GRAD_Y_PLANE
+        and min(views.source.pad, views.target.pad) >= views.window // 2 + SEARCH_PADDING_PX
+    ),
 )
 def _register_level(
     source: Tensor,
@@ -331,17 +322,15 @@ def _register_level(
     level: int,
 ) -> _State:
     """:func:`_search` on the levels ``source`` and ``target``, a chunk of points at a time."""
-    pyramid_0, pyramid_1, o = views
-    scale = 0.5**level
-    level_options = o._replace(epsilon_px=o.epsilon_px * scale)
+    scale, window = 0.5**level, views.window
     size = chunk_size(MAX_CHUNK_POINTS, warp)
-    buffers = None if is_static(warp) else warp.new_empty(2, min(size, len(batch)), 8, o.window * o.window)
+    buffers = None if is_static(warp) else warp.new_empty(2, min(size, len(batch)), 8, window * window)
     parts = []
     for q_, point_, warp_, batch_ in zip(*(y.split(size, -1) for y in (q, point, warp * scale, batch)), strict=True):
-        patch, corner = _patch(pyramid_1, level, warp_[0], batch_, o.window)
-        Q = _basis_images(pyramid_0, q_, batch_, o.window, None if buffers is None else buffers[0, : len(batch_)])
+        patch, corner = _patch(views.target, level, warp_[0], batch_, window)
+        Q = _basis_images(views.source, q_, batch_, window, None if buffers is None else buffers[0, : len(batch_)])
         products = None if buffers is None else buffers[1, : len(batch_)]
-        state = _iterate(Q, patch, _relative_to(corner, warp_), level_options, products)
+        state = _iterate(Q, patch, _relative_to(corner, warp_), views, views.epsilon_px * scale, products)
         inverse = (state.inverse[:6].unflatten(0, (3, 2)) * point_[:, None, None]).sum(0)
         parts.append(state._replace(warp=_relative_to(-corner, state.warp) / scale, inverse=inverse))
     return _State(*(torch.cat(field, -1) for field in zip(*parts, strict=True)))
@@ -351,7 +340,8 @@ def _iterate(
     Q: Tensor,  # (M, 8, w²)
     patch: Tensor,  # (M, 1, s, s)
     warp: Tensor,  # (3, 2, M) px of the patch
-    o: _Options,
+    o: _Views,
+    epsilon_px: float,
     products: Tensor | None,  # (M, 8, w²), to be overwritten
 ) -> _State:
     """Steps of one chunk of points, warps in pixels of the patch; ``inverse`` is the whole one, (8, 8, M)."""
@@ -377,7 +367,7 @@ def _iterate(
         step, previous = _extrapolate(change, step, previous), change
         warp = torch.where(moving, _compose(warp, step, o.window), warp)
         J = _read(patch, warp, o.window)
-        moving = moving & (change.abs().sum(0).amax(0) > o.epsilon_px)
+        moving = moving & (change.abs().sum(0).amax(0) > epsilon_px)
         if not any_possible(moving):
             break
     if o.steps:
@@ -392,13 +382,6 @@ def _extrapolate(change: Tensor, step: Tensor | None, previous: Tensor | None) -
     bend = change - previous
     ratio = (change * bend).sum((0, 1)) / (bend * bend).sum((0, 1)).clamp_min(1e-20)
     return change - ratio.clamp(-MAX_EXTRAPOLATION, MAX_EXTRAPOLATION / (1 + MAX_EXTRAPOLATION)) * (step + bend)
-
-
-def _unregistered(xy_1: Tensor) -> tuple[Tensor, ...]:
-    """The fields of an :class:`AffineRegistration` for points (2, M) that are not registered."""
-    false = torch.zeros_like(xy_1[0], dtype=torch.bool)
-    zero = torch.zeros_like(xy_1[0])
-    return xy_1, _identity(xy_1), zero, _identity(xy_1), zero, false
 
 
 def _covariance(state: _State, point: Tensor, window: int) -> Tensor:

@@ -16,9 +16,6 @@ MAX_CONSTANTS = 512
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-#: Patterns and shapes that passed -> sizes: an iterative fit repeats the same checks at every step.
-_cache: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
-
 
 def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     """Tensors and axis patterns such as ``"B N 2"`` -> sizes of the axes; equal letters must have equal sizes.
@@ -34,20 +31,13 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     Raises:
         ValueError: the number of axes, a fixed size or a shared axis differs from the pattern.
     """
+    shapes = tuple([(name, pattern, None if x is None else x.shape) for name, (x, pattern) in args.items()])
     if torch.compiler.is_compiling():
-        return _bind_axes(where, args)
-    key = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
+        return _bind_axes.__wrapped__(where, shapes)
     try:
-        sizes = _cache.get(key)
+        return dict(_bind_axes(where, shapes))
     except TypeError:  # a symbolic size is not hashable
-        return _bind_axes(where, args)
-    if sizes is None:
-        sizes = _bind_axes(where, args)
-        # Largest number of cached checks; the cache is then cleared.
-        if len(_cache) >= 4096:
-            _cache.clear()
-        _cache[key] = sizes
-    return dict(sizes)
+        return _bind_axes.__wrapped__(where, shapes)
 
 
 def shaped(patterns: str, where: str | None = None) -> Callable[[_Function], _Function]:
@@ -80,13 +70,14 @@ def shaped(patterns: str, where: str | None = None) -> Callable[[_Function], _Fu
     return decorate
 
 
-def _bind_axes(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
+@lru_cache(maxsize=4096)
+def _bind_axes(where: str, shapes: tuple[tuple[str, str, torch.Size | None], ...]) -> dict[str, int]:
+    """Sizes of axes; cached, as an iterative fit repeats the same checks at every step."""
     sizes: dict[str, int] = {}
-    for name, (x, pattern) in args.items():
-        if x is None:
+    for name, pattern, full in shapes:
+        if full is None:
             continue
-        axes = pattern.split()
-        shape = tuple(x.shape)
+        axes, shape = pattern.split(), tuple(full)
         if axes[0] == "*":
             axes = axes[1:]
             shape = shape[len(shape) - len(axes) :] if len(shape) >= len(axes) else shape
@@ -96,7 +87,7 @@ def _bind_axes(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[s
         if not ok:
             bound = ", ".join(f"{k}={v}" for k, v in sizes.items())
             raise ValueError(
-                f"{where}: {name} has shape {tuple(x.shape)}, expected ({pattern}) with {bound or 'any sizes'}"
+                f"{where}: {name} has shape {tuple(full)}, expected ({pattern}) with {bound or 'any sizes'}"
             )
     return sizes
 

@@ -79,7 +79,9 @@ _TRIANGULATE_DTYPES = dict.fromkeys(("uv_0", "uv_1", "f_0", "c_0", "f_1", "c_1",
     kernel=lambda uv_0, *others: run_kernel(
         "triangulate",
         (uv_0, *others),
-        TwoView(*uv_0.new_empty(4, *uv_0.shape[:2]), uv_0.new_empty(uv_0.shape), uv_0.new_empty(*uv_0.shape, 6)),
+        TwoView._make(
+            (*uv_0.new_empty(4, *uv_0.shape[:2]), uv_0.new_empty(uv_0.shape), uv_0.new_empty(*uv_0.shape, 6))
+        ),
     ),
     dtypes=_TRIANGULATE_DTYPES,
     any_layout=tuple(_TRIANGULATE_DTYPES),

@@ -7,7 +7,6 @@ is contiguous over points.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -352,17 +351,13 @@ def select_batch(mask: Tensor, new: S, old: S) -> S:
 
     Gradient: to the chosen ones.
     """
-    return pytree.tree_map(partial(_select_leaf, mask), new, old, is_leaf=_is_pose)
 
+    def select(new: Any, old: Any) -> Any:
+        if isinstance(new, Pose):  # a leaf of the tree: avoids another traversal in every step
+            return Pose(_where(mask, new.R, old.R), _where(mask, new.t, old.t))
+        return None if new is None else _where(mask, new, old)
 
-def _select_leaf(mask: Tensor, new: Any, old: Any) -> Any:
-    if _is_pose(new):  # a leaf of the tree: avoids another traversal in every step
-        return Pose(_where(mask, new.R, old.R), _where(mask, new.t, old.t))
-    return None if new is None else _where(mask, new, old)
-
-
-def _is_pose(x: Any) -> bool:
-    return isinstance(x, Pose)
+    return pytree.tree_map(select, new, old, is_leaf=lambda x: isinstance(x, Pose))
 
 
 def _where(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -176,11 +176,6 @@ def _search_kernel(
     return displacement, valid, A
 
 
-def _levels(*_: Tensor, views: _Views) -> tuple[Tensor, ...]:
-    """Levels of both pyramids."""
-    return *views.source.levels, *views.target.levels
-
-
 @operator(
     kernel=_search_kernel,
     dtypes={
@@ -190,7 +185,7 @@ def _levels(*_: Tensor, views: _Views) -> tuple[Tensor, ...]:
         "known": torch.bool,
         "begun": torch.bool,
     },
-    nested=_levels,
+    nested=lambda *_, views: (*views.source.levels, *views.target.levels),
 )
 def _search(
     x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor, *, views: _Views

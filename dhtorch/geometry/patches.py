@@ -222,19 +222,13 @@ def extract_windows(image: Tensor, first: Tensor, size: int) -> Tensor:
     """
     W = image.shape[-1]
     image = image.contiguous()
-    rows = _row_offsets(size, W, device=image.device)
+    rows = torch.arange(0, size * W, W, device=image.device)
     if _view_is_safe(image):
         # Row by row: a contiguous slice is copied as a block of memory, which is several times faster.
         view = image.as_strided((max(image.numel() - size + 1, 0), size), (1, 1))
         return view.index_select(0, (first.reshape(-1, 1) + rows).flatten()).view(*first.shape, size, size)
     index = first[..., None, None] + rows[:, None] + torch.arange(size, device=image.device)
     return image.flatten()[index]
-
-
-@lru_cache(maxsize=64)
-def _row_offsets(size: int, width: int, *, device: torch.device) -> Tensor:
-    """Flat indices (size,) of the rows of a window relative to its first row; cached."""
-    return torch.arange(0, size * width, width, device=device)
 
 
 def luma(rgb: Tensor, dim: int) -> Tensor:

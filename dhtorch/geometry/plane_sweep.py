@@ -526,10 +526,6 @@ def fit_windows(
     return _fit_windows(base.image, picture_1, uv, uv_nearer, delta_q, in_front, radius=radius)
 
 
-def _has_kernel_radius(*_: Tensor, radius: int) -> bool:
-    return radius == FIT_RADIUS_PX
-
-
 def _fit_windows_kernel(
     grey: Tensor, picture_1: Tensor, uv: Tensor, uv_nearer: Tensor, delta_q: Tensor, in_front: Tensor, *, radius: int
 ) -> WindowFit:
@@ -547,7 +543,7 @@ def _fit_windows_kernel(
     kernel=_fit_windows_kernel,
     dtypes=dict.fromkeys(("grey", "picture_1", "uv", "uv_nearer", "delta_q"), torch.float32) | {"in_front": torch.bool},
     any_layout=("uv", "uv_nearer", "in_front"),
-    when=_has_kernel_radius,
+    when=lambda *_, radius: radius == FIT_RADIUS_PX,
 )
 def _fit_windows(
     grey: Tensor, picture_1: Tensor, uv: Tensor, uv_nearer: Tensor, delta_q: Tensor, in_front: Tensor, *, radius: int

@@ -6,7 +6,6 @@ the source of a search, its gradients along x and y. Pixel i of a level lies at 
 """
 
 from collections.abc import Callable, Hashable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -60,7 +59,9 @@ class Pyramid(NamedTuple):
 
     def corner(self, level: int, x: Tensor) -> Tensor:
         """Points ``x`` (2, M) -> the pixels (2, M) left of and above them, on a level or in the margin around it."""
-        return torch.clamp(x.detach().floor(), *_corner_limits(self.hw(level), device=x.device, dtype=x.dtype))
+        H, W = self.hw(level)
+        last = constant(x, [[W - 1 + OUTSIDE_MARGIN_PX], [H - 1 + OUTSIDE_MARGIN_PX]])
+        return torch.clamp(x.detach().floor(), torch.full_like(last, -OUTSIDE_MARGIN_PX), last)
 
     def locate(
         self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]
@@ -72,7 +73,7 @@ class Pyramid(NamedTuple):
         count, rows, width = self.levels[level].shape[1:]
         corner = self.corner(level, x)
         u, v = corner.long()
-        first = _plane_offsets(planes, rows * width, (self.pad - before) * (width + 1), device=x.device)
+        first = constant(batch, planes)[:, None] * (rows * width) + (self.pad - before) * (width + 1)
         return torch.add(first, batch, alpha=count * rows * width) + torch.add(u, v, alpha=width), x - corner
 
     def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
@@ -98,20 +99,6 @@ class Pyramid(NamedTuple):
         """Windows (P, M, size²) around ``x`` (2, M), interpolated between pixels."""
         first, fraction = self.locate(level, x, batch, size // 2, planes)
         return self.read(level, first, size, fraction)
-
-
-@lru_cache(maxsize=64)
-def _corner_limits(hw: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """First and last pixel (2, 1) of an image with the margin around it."""
-    H, W = hw
-    last = torch.tensor([[W - 1 + OUTSIDE_MARGIN_PX], [H - 1 + OUTSIDE_MARGIN_PX]], device=device, dtype=dtype)
-    return torch.full_like(last, -OUTSIDE_MARGIN_PX), last
-
-
-@lru_cache(maxsize=256)
-def _plane_offsets(planes: tuple[int, ...], size: int, shift: int, *, device: torch.device) -> Tensor:
-    """Flat indices (P, 1) of pixel ``shift`` of the ``planes``, of ``size`` pixels each."""
-    return torch.tensor(planes, device=device)[:, None] * size + shift
 
 
 class PyramidCache:
@@ -192,11 +179,12 @@ def build_pyramid(
     return Pyramid(tuple(chain), pad)
 
 
-def _fill_level_kernel(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None:
-    torch.ops.dhtorch.pyramid_level.default(below, level, pad, not finest, below.dtype == torch.uint8)
-
-
-@operator(kernel=_fill_level_kernel, dtypes={"below": (torch.uint8, torch.float32), "level": torch.float32})
+@operator(
+    kernel=lambda below, level, *, pad, finest: torch.ops.dhtorch.pyramid_level.default(
+        below, level, pad, not finest, below.dtype == torch.uint8
+    ),
+    dtypes={"below": (torch.uint8, torch.float32), "level": torch.float32},
+)
 def _fill_level(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None:
     """Fill a padded ``level`` from the level ``below`` it, or the ``finest`` from the images themselves."""
     grey = level[:, GREY_PLANE : GREY_PLANE + 1]

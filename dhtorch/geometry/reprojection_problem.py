@@ -370,13 +370,9 @@ def pose_normal_equations(
     return pose_normal_equations_at(problem, noise, far_weight, shutter_precision, kernel=kernel, bend=bend)[0](at)
 
 
-#: Numbers of the tracks, factors of their noise, and their weights in the cost.
-_Fixed = tuple[TrackConstants, tuple[Tensor, Tensor, Tensor], Tensor]
-
-
 def _fixed_tensors(
     problem: PoseDepthProblem, noise: Tensor, far_weight: Tensor, known: TrackConstants | None = None
-) -> _Fixed:
+) -> tuple[TrackConstants, tuple[Tensor, Tensor, Tensor], Tensor]:
     """What the cost of tracks contains beside the unknowns."""
     constants = track_constants(problem) if known is None else known
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
@@ -391,7 +387,7 @@ def pose_normal_equations_at(
     *,
     kernel: str | None,
     bend: float,
-    fixed: _Fixed | None = None,
+    fixed: tuple[TrackConstants, tuple[Tensor, Tensor, Tensor], Tensor] | None = None,
 ) -> tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]:
     """:func:`pose_normal_equations` as a function of the unknowns, and its cost (B,) alone with the same bits.
 
@@ -416,16 +412,12 @@ def pose_normal_equations_at(
     robust = kernel, bend
 
     def normal(at: Unknowns) -> NormalEquations:
-        def linear() -> LinearisedTracks:
-            return linearise_tracks(problem, at, known=constants)
-
+        linear = partial(linearise_tracks, problem, at, known=constants)
         tensors = _track_tensors(problem, constants, factors, at)
         return with_prior(*_equations(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     def cost(at: Unknowns) -> Tensor:
-        def linear() -> LinearisedTracks:
-            return linearise_tracks(problem, at, columns=False, known=constants)
-
+        linear = partial(linearise_tracks, problem, at, columns=False, known=constants)
         tensors = _track_tensors(problem, constants, factors, at)
         return total_cost(_robust_cost(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
@@ -460,21 +452,18 @@ def minimise_tracks(
     return _minimum(*tensors, share, shutter_precision, cost_of=cost_of, at=at, robust=(kernel, bend), options=options)
 
 
-#: A robust kernel's name and where it bends, as ``least_squares.robust_loss`` takes them.
-_Robust = tuple[str | None, float]
-
-#: -> normal equations as a function of the unknowns, and the cost alone.
-_CostOf = Callable[[], tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]]
-
-
-def _is_geman_mcclure(*tensors: Any, robust: _Robust, **_: Any) -> bool:
+def _is_geman_mcclure(*tensors: Any, robust: tuple[str | None, float], **_: Any) -> bool:
     """Whether the compiled kernels implement the robust kernel, divide the number of tracks and fit the precision."""
     is_one_precision = len({x.dtype for x in tensors if x is not None} - {torch.bool}) == 1
     return robust[0] == "geman_mcclure" and is_one_precision and _has_whole_lanes(tensors[0])
 
 
 def _minimum_kernel(
-    *tensors: Any, cost_of: _CostOf, at: Unknowns, robust: _Robust, options: tuple[int, bool]
+    *tensors: Any,
+    cost_of: Callable[..., Any],
+    at: Unknowns,
+    robust: tuple[str | None, float],
+    options: tuple[int, bool],
 ) -> tuple[Unknowns, Tensor]:
     *tracks, share, precision = tensors
     kernel_args = [x.contiguous() for x in _kernel_arguments(*tracks)]
@@ -505,7 +494,11 @@ def _minimum_kernel(
     when=_is_geman_mcclure,
 )
 def _minimum(
-    *tensors: Any, cost_of: _CostOf, at: Unknowns, robust: _Robust, options: tuple[int, bool]
+    *tensors: Any,
+    cost_of: Callable[..., Any],
+    at: Unknowns,
+    robust: tuple[str | None, float],
+    options: tuple[int, bool],
 ) -> tuple[Unknowns, Tensor]:
     """:func:`minimise_tracks` of :func:`_track_tensors`, their weight ``share`` (B, N) and the prior's precision."""
     (normal, cost), (steps, rotation_only) = cost_of(), options
@@ -531,7 +524,9 @@ def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquat
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
-def _equations(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
+def _equations(
+    *tensors: Any, linear: Callable[[], LinearisedTracks], robust: tuple[str | None, float]
+) -> NormalEquations:
     """Cost, H and g of :func:`_track_tensors` with the weight ``share`` (B, N) of each track, before any prior."""
     tracks, (a, b, d), shutter_rate, share = linear(), tensors[8:11], tensors[-2], tensors[-1]
     rows = whitened_residuals(tracks, (a, b, d), shutter_rate is not None)
@@ -546,7 +541,7 @@ def _equations(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _R
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
-def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
+def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: tuple[str | None, float]) -> Tensor:
     """The cost (B,) of :func:`_equations` alone."""
     square = squared_residuals(linear(), tensors[8:11])
     return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
@@ -590,7 +585,10 @@ def sandwich_sums(
     when=_is_geman_mcclure,
 )
 def _sandwich(
-    *tensors: Any, reference: Callable[[], tuple[Tensor, Tensor]], robust: _Robust, limits: tuple[float, float, float]
+    *tensors: Any,
+    reference: Callable[[], tuple[Tensor, Tensor]],
+    robust: tuple[str | None, float],
+    limits: tuple[float, float, float],
 ) -> tuple[Tensor, Tensor]:
     """:func:`sandwich_sums` of :func:`_track_tensors`, far tracks (B, N) and their weight (B,)."""
     return reference()

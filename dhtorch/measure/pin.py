@@ -25,10 +25,9 @@ from dhtorch.geometry import motion_fit, se3
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.geometry.covariance import chi2_quantile, mahalanobis, masked_median
-from dhtorch.geometry.epipolar_motion import fit_epipolar_motion
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.least_squares import select_batch
-from dhtorch.geometry.motion_fit import MotionFit, Sightings
+from dhtorch.geometry.motion_fit import MotionFit, Sightings, fit_epipolar_motion
 from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.pair import undistort_tracks, uniform_draws

@@ -4,7 +4,6 @@ A sample without a usable return is NaN and flagged, never filled from its neigh
 """
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import all_finite, check, is_transformed, shaped
+from dhtorch.geometry.checks import all_finite, check, constant, shaped
 from dhtorch.geometry.patches import (
     containing_pixels,
     extract_patches,
@@ -136,11 +135,6 @@ def _intrinsics(camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
     return camera.f, camera.c, camera.distortion
 
 
-def _is_dense_read(*_: Tensor | None, frame: Frame, search_px: int | None, limits: ReturnLimits) -> bool:
-    """Whether samples read the nearest pixel of a dense map, with a confidence threshold that fits a byte."""
-    return not search_px and frame.sparse is None and 0 <= limits.min_conf <= 255
-
-
 def _read_samples_kernel(
     image: Tensor, depth: Tensor, conf: Tensor | None, uv: Tensor, *_: Tensor | None, **options: Any
 ) -> Samples:
@@ -204,7 +198,8 @@ def _project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         "depth_distortion": torch.float32,
     },
     any_layout=("image", "uv", "f", "c", "distortion", "depth_f", "depth_c", "depth_distortion"),
-    when=_is_dense_read,
+    # Samples read the nearest pixel of a dense map, with a confidence threshold that fits a byte.
+    when=lambda *_, frame, search_px, limits: not search_px and frame.sparse is None and 0 <= limits.min_conf <= 255,
 )
 def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: ReturnLimits) -> Samples:
     """:func:`backproject` of a frame; ``tensors`` are the frame's tensors that the kernel reads, and uv (B, N, 2)."""
@@ -394,11 +389,5 @@ def _bits(*masks: tuple[Tensor, int]) -> Tensor:
             (torch.where(mask, bit, 0) for mask, bit in masks[1:]), torch.where(masks[0][0], masks[0][1], 0)
         ).int()
     stacked = torch.stack([mask for mask, _ in masks])
-    bits = (_bytes.__wrapped__ if is_transformed() else _bytes)(tuple(bit for _, bit in masks), device=stacked.device)
+    bits = constant(stacked.to(torch.uint8), [bit for _, bit in masks])[:, None, None]
     return torch.where(stacked, bits, 0).sum(0, dtype=torch.int32)
-
-
-@lru_cache(maxsize=32)
-def _bytes(values: tuple[int, ...], *, device: torch.device) -> Tensor:
-    """Numbers below 256 as a tensor (K, 1, 1); cached, because few distinct values occur."""
-    return torch.tensor(values, dtype=torch.uint8, device=device)[:, None, None]

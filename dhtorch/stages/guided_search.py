@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
@@ -65,24 +66,6 @@ class _Points(NamedTuple):
     q_max: Tensor  # (M,) 1/m, end of the segment
     batch: Tensor  # (M,)
     segments: tuple[_Segment, ...]  # one per view
-
-
-class _Windows(NamedTuple):
-    """Windows of M samples in the reference view."""
-
-    batch: Tensor  # (M,)
-    small_0: DownscaledImage
-    template: Tensor  # (M, P) without their means
-    level: int
-
-
-class _SearchLimits(NamedTuple):
-    """Options of the search; see :func:`guided_search`."""
-
-    hypotheses: int
-    min_ncc: float
-    max_cost_ratio: float
-    exclusion: int
 
 
 @shaped("image_0: B C H W, samples.xyz: B N 3, wanted: B N, images_1: V B C h w, T_1_from_0.t: V B 3")
@@ -145,13 +128,13 @@ def guided_search(
         ]
         V = len(images_1)
         empty = points.uv_0.new_zeros(1, searched.numel())
-        limits = _SearchLimits(hypotheses, min_ncc, max_cost_ratio, exclusion)
+        limits = hypotheses, min_ncc, max_cost_ratio, exclusion
 
         def search(uv_0: Tensor, q_max: Tensor, batch: Tensor, *segments: _Segment) -> tuple[Tensor, ...]:
-            points = _Points(uv_0, q_max, batch, segments)
             # The windows of 96 points in one view take about a megabyte and fit the cache.
-            size = chunk_size(96, uv_0)
-            chunks = [_search(levels, part, limits) for part in _split_points(points, size)]
+            leaves, spec = pytree.tree_flatten(_Points(uv_0, q_max, batch, segments))
+            parts = zip(*(x.split(chunk_size(96, uv_0), -1) for x in leaves), strict=True)
+            chunks = [_search(levels, pytree.tree_unflatten(part, spec), *limits) for part in parts]
             return tuple(torch.cat(field, -1) for field in zip(*chunks, strict=True))
 
         fields = masked_apply(
@@ -221,29 +204,15 @@ def _points(
     return _Points(uv_0.reshape(B * N, 2).T, q_max.repeat_interleave(N), batch, tuple(segments))
 
 
-def _split_points(points: _Points, size: int) -> list[_Points]:
-    """The points in parts of ``size``, so that the windows of a part stay in the cache."""
-    count = points.uv_0.shape[-1]
-
-    def part(x: Tensor, first: int) -> Tensor:
-        return x[..., first : first + size]
-
-    return [
-        _Points(
-            part(points.uv_0, k),
-            part(points.q_max, k),
-            part(points.batch, k),
-            tuple(_Segment._make(part(x, k) for x in segment) for segment in points.segments),
-        )
-        for k in range(0, count, size)
-    ]
-
-
 def _search(
-    levels: list[tuple[DownscaledImage, list[DownscaledImage]]], points: _Points, limits: _SearchLimits
+    levels: list[tuple[DownscaledImage, list[DownscaledImage]]],
+    points: _Points,
+    K: int,
+    min_ncc: float,
+    max_cost_ratio: float,
+    exclusion: int,
 ) -> tuple[Tensor, ...]:
     """Points → (V, M) inverse depth, variance (px²), ncc and rms of the match in each view; (1, M) unique (0 or 1)."""
-    K = limits.hypotheses
     q = points.q_max[:, None] * torch.linspace(0, 1, K, device=points.q_max.device, dtype=points.q_max.dtype)
     step = points.q_max / (K - 1)
     unique = torch.ones_like(step, dtype=torch.bool)
@@ -254,7 +223,8 @@ def _search(
         u, v = _window_offsets(level, points.uv_0)
         x, y = (((points.uv_0[i] - small_0.first) / small_0.scale)[:, None] + d for i, d in ((0, u), (1, v)))
         template = _read_bilinear(small_0.grey, points.batch, x, y)
-        windows = _Windows(points.batch, small_0, template - template.mean(-1, keepdim=True), level)
+        template = template - template.mean(-1, keepdim=True)
+        windows = points.batch, small_0, template, level
         views = [_correlate(windows, s, q, small_1) for s, small_1 in zip(points.segments, smalls_1, strict=True)]
         ncc = torch.stack([view[0] for view in views])  # (V, M, K)
         ordered = ncc.clamp_min(0).sort(0, descending=True).values.cumsum(0)
@@ -270,12 +240,12 @@ def _search(
             vertex = middle + (right - left).square() / (8 * bend)
             is_peak = (middle >= left) & (middle >= right)
             peak = torch.cat((joint[:, :1], torch.where(is_peak, vertex, middle).clamp(max=1), joint[:, -1:]), 1)
-            elsewhere = torch.where((place - k[:, None]).abs() >= limits.exclusion, peak, -1.0).amax(-1)
+            elsewhere = torch.where((place - k[:, None]).abs() >= exclusion, peak, -1.0).amax(-1)
             best = peak.gather(1, k[:, None])[:, 0]
             # On the built-in rooms interpolation alone costs some hundredths: below .05 costs do not differ.
-            unique = (1 - best + 0.05) < limits.max_cost_ratio * (1 - elsewhere + 0.05)
+            unique = (1 - best + 0.05) < max_cost_ratio * (1 - elsewhere + 0.05)
         if level == 1:
-            unique = unique & (score >= limits.min_ncc)
+            unique = unique & (score >= min_ncc)
         if level == len(levels) - 1:
             break
         centre = q.gather(1, k[:, None])[:, 0] + _vertex(joint, k)[0] * step
@@ -283,8 +253,7 @@ def _search(
         # 7 hypotheses at a third of the distance on the image before: one of those distances to both sides.
         reach = torch.arange(7, device=q.device, dtype=q.dtype) - 3
         q = (centre[:, None] + reach * step[:, None]).clamp_min(0)
-    spread = windows.template.square().mean(-1).sqrt()
-    fields = _matches_of_views(views, q, joint, step, spread)
+    fields = _matches_of_views(views, q, joint, step, template.square().mean(-1).sqrt())
     return (*fields, unique[None].to(step))
 
 
@@ -339,13 +308,13 @@ def _window_offsets(level: int, like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _correlate(
-    windows: _Windows,
+    windows: tuple[Tensor, DownscaledImage, Tensor, int],
     s: _Segment,
     q: Tensor,  # (M, K)
     small_1: DownscaledImage,
 ) -> tuple[Tensor, Tensor]:
     """Correlation (M, K) of the windows at inverse depths q, -1 outside the picture, and their pixels (2, M, K)."""
-    batch, small_0, template, level = windows
+    batch, small_0, template, level = windows  # (M,), and windows (M, P) of the reference view without their means
     place, depth = _pixels(s, s.centre, q)
     turn = small_0.scale / small_1.scale / AFFINE_HALF_WIDTH_PX
     du, dv = ((_pixels(s, ray, q)[0] - place) * turn for ray in (s.right, s.below))

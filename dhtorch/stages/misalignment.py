@@ -151,12 +151,8 @@ def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Cam
     """Near returns and the parallax of their tracks under the pose, the fit's rolling shutter undone."""
     T, rate = fit.T_1_from_0, None if fit.shutter is None else fit.shutter.shutter_rate
     seen = tracks.uv_0, tracks.uv_1, tracks.valid
-    return _parallax(*seen, samples.xyz, samples.sigma, fit.ok, T.R, T.t, rate, *_intrinsics(camera_0, camera_1))
-
-
-def _intrinsics(*cameras: Camera) -> tuple[Tensor, ...]:
-    """Focal lengths and principal point (B, 2) px of each camera."""
-    return tuple(x for camera in cameras for x in (camera.f, camera.c))
+    intrinsics = camera_0.f, camera_0.c, camera_1.f, camera_1.c
+    return _parallax(*seen, samples.xyz, samples.sigma, fit.ok, T.R, T.t, rate, *intrinsics)
 
 
 def _parallax_kernel(*tensors: Any) -> _Parallax:

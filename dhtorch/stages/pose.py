@@ -12,8 +12,7 @@ from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, p3p, ransac, reprojection_problem, se3
 from dhtorch.geometry.checks import all_finite, shaped
-from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, round_up
-from dhtorch.geometry.inference_mode import run_without_grad
+from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, round_up, run_without_grad
 from dhtorch.geometry.least_squares import (
     INITIAL_DAMPING,
     MIN_DEPTH,

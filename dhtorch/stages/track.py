@@ -22,8 +22,7 @@ from dhtorch.geometry.coarse_flow import (
     is_not_identity,
     undo_similarity,
 )
-from dhtorch.geometry.determinism import round_up
-from dhtorch.geometry.inference_mode import run_without_grad
+from dhtorch.geometry.determinism import round_up, run_without_grad
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.pyramid import Pyramid, PyramidCache, build_pyramid
 from dhtorch.records import NO_HINT, TrackHint, Tracks

@@ -9,12 +9,16 @@ from torch import Tensor
 from dhtorch.codes import Gate, Hole, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
-from dhtorch.geometry.checks import all_finite, shaped
+from dhtorch.geometry.checks import all_finite, constant, shaped
 from dhtorch.geometry.covariance import masked_median, noise_shape
-from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
-from dhtorch.geometry.se3 import Pose
-from dhtorch.records import Camera, Estimate, PoseFit, Samples, SigmaBudget, Tracks
+from dhtorch.records import Camera, Estimate, Pose, PoseFit, Samples, SigmaBudget, Tracks
+
+#: Approximate number of samples in a cell of the image.
+SAMPLES_PER_CELL = 10
+
+#: Lower limit of the number of answers that are tested.
+MIN_FREE_SPACE_ANSWERS = 10
 
 
 @shaped("tracks.uv_0: B N 2, samples.uv: B N 2, fit.T_1_from_0.R: B 3 3")
@@ -72,7 +76,7 @@ def two_view(
         max_far_noise: standard deviation of the far tracks' residuals, of a ray with z = 1, above which the near
             returns are taken as independently moving and no point of the pair is answered; None = no limit.
         max_in_reach: fraction of the answers that may lie where the sensor would have measured them
-            (:func:`dhtorch.geometry.free_space.free_space_violations`); above it no point is answered. None = no limit.
+            (:func:`free_space_violations`); above it no point is answered. None = no limit.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: fraction of that shape which does not depend on the patch, see ``covariance.noise_shape``.
@@ -102,8 +106,8 @@ def two_view(
     """
     posed, static = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
     tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1)
-    uv_0, uv_1 = _zero_invalid(tracks.uv_0, tracked), _zero_invalid(tracks.uv_1, tracked)
-    cov = _zero_invalid(tracks.cov.flatten(-2), tracked).unflatten(-1, (2, 2))
+    uv_0, uv_1 = (torch.where(tracked[..., None], x, 0) for x in (tracks.uv_0, tracks.uv_1))
+    cov = torch.where(tracked[..., None, None], tracks.cov, 0)
     grey_rms, round_trip, texture = (
         torch.where(tracked, x, 0) for x in (tracks.photometric, tracks.error, samples.trackability)
     )
@@ -112,7 +116,10 @@ def two_view(
         y = cam.ray_heights(camera_0, uv_0)
         shutter_rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
-    geometry = solver(uv_0, uv_1, camera_0, camera_1, _safe_pose(fit))
+    # Without a pose a fixed valid one, so that arithmetic and gradients stay finite.
+    T, eye = fit.T_1_from_0, torch.eye(3, dtype=fit.cov.dtype, device=fit.cov.device)
+    T = Pose(torch.where(posed[..., None], T.R, eye), torch.where(posed, T.t, eye[0]))
+    geometry = solver(uv_0, uv_1, camera_0, camera_1, T)
     parallax_deg = geometry.parallax * (180 / math.pi)
     mismatch = grey_rms / texture.clamp_min(1e-8).sqrt()
     if fitted_noise:  # the shape of the tracks' covariances and the scale of the pose's residuals
@@ -160,9 +167,9 @@ def two_view(
     keep, measured = gate == Gate.ANSWER, tracked & posed
     return Estimate(
         uv=samples.uv,
-        depth=_keep_or_nan(keep, geometry.depth),
-        sigma=_keep_or_nan(keep, sigma),
-        sigma_shared=_keep_or_nan(keep, _root(shared, keep)),
+        depth=torch.where(keep, geometry.depth, torch.nan),
+        sigma=torch.where(keep, sigma, torch.nan),
+        sigma_shared=torch.where(keep, _root(shared, keep), torch.nan),
         parallax_deg=torch.where(measured, parallax_deg, torch.zeros_like(parallax_deg)),
         residual_px=torch.where(measured, geometry.residual_px, torch.zeros_like(geometry.residual_px)),
         n_views=torch.where(measured, 2, 1).to(torch.int32),
@@ -194,23 +201,68 @@ def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:
     return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x <= limit)
 
 
-def _safe_pose(fit: PoseFit) -> Pose:
-    """The fitted pose, or a fixed valid one where there is none, so that arithmetic and gradients stay finite."""
-    ok = fit.ok
-    R, t = fit.T_1_from_0.R, fit.T_1_from_0.t
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return Pose(torch.where(ok[:, None, None], R, eye), torch.where(ok[:, None], t, eye[0]))
-
-
-def _zero_invalid(uv: Tensor, valid: Tensor) -> Tensor:
-    return torch.where(valid[..., None], uv, torch.zeros_like(uv))
-
-
-def _keep_or_nan(keep: Tensor, x: Tensor) -> Tensor:
-    return torch.where(keep, x, torch.full_like(x, torch.nan))
-
-
 def _root(x: Tensor, keep: Tensor) -> Tensor:
     """Square root whose gradient stays finite where the value is not used or zero."""
     positive = keep & (x > 0)
     return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
+
+
+@shaped("uv: B N 2, sensed: B N, pose_returns: B N, candidates: B N, depth: B N, sigma: B N")
+def free_space_violations(
+    uv: Tensor,  # (B, N, 2) px
+    sensed: Tensor,  # (B, N) m, 0 = no return
+    pose_returns: Tensor,  # (B, N) bool
+    candidates: Tensor,  # (B, N) bool
+    depth: Tensor,  # (B, N) m
+    sigma: Tensor,  # (B, N) m
+) -> Tensor:
+    """Fraction (B,) of the answers without return whose depth plus two sigma is below the median depth of the returns.
+
+    Args:
+        uv: samples.
+        sensed: depth of the sensor at the samples.
+        pose_returns: returns that the pose is estimated from; their median depth is within the range of the sensor.
+        candidates: answers at samples whose return is missing for no other reason. Only those in cells of the image
+            without any return are tested: small holes between returns are usual.
+        depth, sigma: depth of the answers and its standard deviation.
+
+    Returns:
+        0 where fewer than :data:`MIN_FREE_SPACE_ANSWERS` answers are tested, for a sensor that is sparse also where it
+        has returns, and where more returns than answers are given: a moving object would then be most of the measured
+        scene, and a sensor of long range has its holes for other reasons.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: none.
+    """
+    has_return = sensed > 0
+    pose_returns = pose_returns & has_return
+    return_ratio = _return_ratio(uv, has_return)
+    # Lower limit of the fraction of samples with a return in the cells of returns; in sparser data a missing return
+    # is no evidence of free space.
+    dense = torch.where(has_return, return_ratio, 0).sum(-1) >= 0.6 * has_return.sum(-1).clamp_min(1)
+    few_returns = pose_returns.sum(-1) <= candidates.sum(-1)
+    candidates = candidates & (return_ratio == 0)
+    violating = candidates & (depth.detach() + 2 * sigma.detach() < masked_median(sensed.detach(), pose_returns))
+    n = candidates.sum(-1)
+    ratio = violating.sum(-1) / n.clamp_min(1).to(depth.dtype)
+    testable = dense & pose_returns.any(-1) & (n >= MIN_FREE_SPACE_ANSWERS) & few_returns
+    return torch.where(testable, ratio, torch.zeros_like(ratio))
+
+
+def _return_ratio(uv: Tensor, has_return: Tensor) -> Tensor:
+    """Fraction (B, N) of the samples in each sample's cell that have a return; cells divide the samples' extent."""
+    N = uv.shape[1]
+    rows = max(1, round((0.75 * N / SAMPLES_PER_CELL) ** 0.5))
+    columns = max(1, round(N / SAMPLES_PER_CELL / rows))
+    lowest, highest = uv.detach().amin(1, keepdim=True), uv.detach().amax(1, keepdim=True)
+    cell_position = (uv.detach() - lowest) / (highest - lowest).clamp_min(1e-6) * constant(uv, [columns, rows])
+    column, row = cell_position.long().unbind(-1)
+    cell = column.clamp_max(columns - 1) + columns * row.clamp_max(rows - 1)
+    ones = torch.ones_like(uv[..., 0])
+    empty = ones.new_zeros(len(ones), columns * rows)
+    in_cell, returns = (
+        empty.scatter_add(1, cell, x) for x in (ones, torch.where(has_return, ones, 0))
+    )  # integers: exact
+    return returns.gather(1, cell) / in_cell.gather(1, cell)

@@ -241,15 +241,6 @@ def test_points_without_texture_outside_or_refuted_are_not_valid_and_stay_finite
     assert not kept.valid.any() and fn.track_points_lk(*pictures(), places(), fb_threshold=None).valid.all()
 
 
-def test_a_start_replaces_the_pyramid():
-    points, shift = places(n=20), torch.tensor([14.0, 9.0], dtype=torch.float64)
-    options = {"num_levels": 1, "window_size": 9}
-    alone = fn.track_points_lk(*pictures(shift=shift.tolist()), points, **options)
-    begun = fn.track_points_lk(*pictures(shift=shift.tolist()), points, points + shift + 0.5, **options)
-    right = [(((x.points - points - shift).abs() < 0.1).all(-1) & x.valid).double().mean() for x in (alone, begun)]
-    assert right[0] < 0.5 < 0.9 < right[1]
-
-
 def test_poses_are_those_of_poselib():
     poselib = pytest.importorskip("poselib")
     xyz, _, points2, _, _ = scene((50,), n=3)

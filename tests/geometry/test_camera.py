@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, all_known, any_possible, check, is_static
+from dhtorch.geometry.checks import check
 
 HW = (480, 640)
 
@@ -21,8 +21,6 @@ LENSES = {
     "third order": [0.03, -0.05, 0.001, -0.002, 0.04],
     "rational": [0.9, 0.25, -0.002, 0.003, 0.02, 1.1, 0.4, 0.06],
 }
-
-lenses = pytest.mark.parametrize("lens", LENSES.values(), ids=list(LENSES))
 
 
 def double(*values):
@@ -239,22 +237,3 @@ def test_equal_letters_are_equal_sizes_or_the_message_names_the_argument(tensors
         return
     with pytest.raises(ValueError, match=sizes):
         check("here", **tensors)
-
-
-def test_values_are_read_where_there_is_no_transform():
-    mask = torch.tensor([[True, True], [True, False], [False, False]])
-    assert [all_known(x) for x in mask] == [True, False, False] and [any_possible(x) for x in mask] == [
-        True,
-        True,
-        False,
-    ]
-    seen = []
-    torch.vmap(lambda x: (seen.append((is_static(x), all_known(x), any_possible(x))), x)[1])(mask[2:])
-    torch.func.grad(lambda x: (seen.append((is_static(x), all_known(x), any_possible(x))), x.sum())[1])(torch.zeros(2))
-    assert seen == [(True, False, True)] * 2 and not is_static(mask)
-    captured = torch.compile(lambda v: v + 1 if is_static(v) else v - 1, fullgraph=True, backend="eager")
-    assert captured(torch.zeros(1)).item() == 1
-    x = torch.tensor([[1.0, -3e38], [torch.nan, 1], [1, torch.inf], [1, -torch.inf], [-torch.inf, torch.nan]])
-    for dim in (0, 1):
-        assert torch.equal(all_finite(x, dim), x.isfinite().all(dim))
-    assert all_finite(x[:0], 1).shape == (0,)

@@ -10,11 +10,8 @@ from support.contract_rows import equal
 from torch import Tensor
 
 from dhtorch.geometry import coarse_flow as start
-from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES
-from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.records import TrackHint
-from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade, lucas_kanade_affine
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 H, W = 240, 320
 
@@ -182,28 +179,3 @@ def test_the_way_back_starts_from_its_own_estimate() -> None:
     silent = right[0].replace(uv_1=torch.full_like(right[0].uv_1, torch.nan))
     nowhere = track(hint=TrackHint(flows=(silent, silent)))
     assert torch.equal(nowhere.uv_1, track().uv_1) or not nowhere.valid.any()
-
-
-def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
-    """A point that was told where to look is searched for there and nowhere else; one that was not, everywhere."""
-    a, b, _ = _pair(5, (40.0, 0.0))
-    source, target = build_pyramid(a, 5, 21), build_pyramid(b, 5, 21)
-    o = lk.SearchOptions(21, 30, 0.01, MIN_TRACK_EIGENVALUE, "bias")
-    x = (60 + 200 * torch.rand(2, ELEMENTWISE_LANES * 8, generator=torch.Generator().manual_seed(1))).clamp_max(H - 60)
-    expected = torch.tensor([[40.0], [0.0]]).expand_as(x)
-    every, none = torch.ones_like(x[0], dtype=torch.bool), torch.zeros_like(x[0], dtype=torch.bool)
-
-    def share(d: Tensor, begun: Tensor, near_levels: int) -> float:
-        found, ok, _ = lk.search_displacements(
-            source, target, o, x, d, torch.zeros_like(x[0], dtype=torch.long), known=every, alike=False,
-            begun=begun, near_levels=near_levels,
-        )  # fmt: skip
-        right = ok & ((found - expected).square().sum(0).sqrt() < 0.5)
-        return float(right.float().mean())
-
-    zero = torch.zeros_like(x)
-    assert share(zero, none, 2) == share(zero, every, 5) > 0.8, "from nothing, by all levels"
-    assert share(zero, every, 2) < 0.3, "told to look near, where it is not"
-    assert share(expected + 6.0, every, 2) > 0.8
-    half = torch.arange(x.shape[1]) % 2 == 0
-    assert share(torch.where(half, expected + 6.0, zero), half, 2) > 0.8, "each by its own"

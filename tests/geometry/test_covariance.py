@@ -23,16 +23,6 @@ def test_the_covariance_is_the_inverse_times_the_variance():
         np.testing.assert_allclose(cov[b], float(sigma[b]) ** 2 * np.linalg.inv(H[b].numpy()), rtol=1e-9, atol=1e-12)
 
 
-def test_a_length_in_standard_deviations():
-    g = torch.Generator().manual_seed(1)
-    x, cov = torch.randn(3, 4, generator=g, dtype=D), positive(4, 3)
-    cov[1] = 0
-    found = covariance.mahalanobis(x, cov)
-    wanted = [np.sqrt(x[b].numpy() @ np.linalg.inv(cov[b].numpy()) @ x[b].numpy()) for b in (0, 2)]
-    np.testing.assert_allclose(found[::2], wanted, rtol=1e-9)
-    assert found[1] == 0 and covariance.mahalanobis(0 * x, cov)[0] == 0
-
-
 @pytest.mark.parametrize(
     ("values", "used", "wanted"),
     [

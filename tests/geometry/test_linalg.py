@@ -54,26 +54,3 @@ def test_equal_eigenvalues_pass_the_gradient_of_their_mean():
     smaller, larger = small.eigenvalues_2x2(a, b, c)
     for found in (smaller, larger):
         assert [float(g) for g in torch.autograd.grad(found, (a, b, c), retain_graph=True)] == [0.5, 0.0, 0.5]
-
-
-def test_a_quadratic_form_reads_the_upper_half():
-    S, v = matrices(20, 2, 2), matrices(20, 2, seed=1)
-    whole = torch.triu(S) + torch.triu(S, 1).mT
-    want = torch.einsum("ni,nij,nj->n", v, whole, v)
-    torch.testing.assert_close(small.quadratic_form(*v.unbind(-1), *small.upper_triangle(S)), want)
-    assert [x[3].item() for x in small.upper_triangle(S)] == [S[3, 0, 0].item(), S[3, 0, 1].item(), S[3, 1, 1].item()]
-
-
-def test_products_are_matrix_products():
-    A, B = matrices(7, 3, 2), matrices(7, 2, 4, seed=1)
-    torch.testing.assert_close(small.small_matmul(A, B), A @ B)
-    planes = small.matmul_planes(A.movedim(0, -1), B.movedim(0, -1))
-    torch.testing.assert_close(planes.movedim(-1, 0), A @ B)
-    R, x = matrices(4, 3, 3), matrices(4, 3, 11, seed=1)
-    torch.testing.assert_close(small.rotate_planes(R, x), R @ x)
-
-
-def test_cofactors_are_the_inverse_transposed_times_the_determinant():
-    A = matrices(9, 3, 3)
-    found = small.cofactor_planes(A.movedim(0, -1)).movedim(-1, 0)
-    torch.testing.assert_close(found, torch.linalg.inv(A).mT * torch.linalg.det(A)[:, None, None])

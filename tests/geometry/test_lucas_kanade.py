@@ -237,24 +237,3 @@ def test_the_covariance_is_variance_over_texture_kept_from_vanishing():
 
 
 # --- default options, and with a graph -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("normalise", NORMALISE)
-@pytest.mark.parametrize("who", range(3))
-def test_with_a_graph_valid_tracks_take_one_more_step(normalise, who):
-    src, dst = two_views((0.5, -0.4))
-    fade = torch.linspace(0.001, 0.1, W, dtype=torch.float64)  # also less texture than by default is enough
-    leaves = [0.5 + fade * (src - 0.5), 0.5 + fade * (dst - 0.5), places(2, 20, H, W, margin=12)]
-    few = {"normalise": normalise, "min_eigenvalue": 1e-9, "iterations": 1, "max_round_trip_px": 0.01}
-    plain = lucas_kanade(*leaves, **OPTIONS | few)
-    assert 0.1 < plain.valid.float().mean() < 0.95 and not plain.uv_1.requires_grad
-    leaves[who] = leaves[who].requires_grad_()
-    graph = lucas_kanade(*leaves, **OPTIONS | few)
-    step = refine_tracks(*leaves, plain.uv_1, window=WINDOW, normalise=normalise, min_eigenvalue=1e-9)
-    assert torch.equal(graph.uv_1, torch.where(plain.valid[..., None], step, plain.uv_1))
-    assert all(torch.equal(getattr(graph, f), getattr(plain, f)) for f in FIELDS[1:])
-    assert not graph.error.requires_grad and not graph.cov.requires_grad
-    for valid in (True, False):
-        answered = graph.uv_1[plain.valid == valid].sum()
-        (slope,) = torch.autograd.grad(answered, leaves[who], retain_graph=True)
-        assert bool((slope != 0).any()) == valid

@@ -16,7 +16,6 @@ from dhtorch.geometry.reprojection_problem import (
     MIN_NOISE_PX,
     estimate_noise_variance,
 )
-from dhtorch.stages.pose import map_pose
 
 D = torch.float64
 
@@ -116,26 +115,6 @@ def test_a_pose_that_is_not_determined_has_no_covariance():
     assert ok.tolist() == [True, False] and cov[0].any() and not cov[1].any()
 
 
-def normalised_square(shared_px, blocks, n=60):
-    """Mean squared error of n poses in standard deviations, per parameter; tracks of a twelfth of the image share an
-    error of ``shared_px``."""
-    args, T, *_ = map_pose_inputs(n, 160, 0, noise=0.3, depth=0.002, baseline=0.3, seed=5)
-    samples, tracks = args[:2]
-    cell = (tracks.uv_0[..., 0] // 160).clamp(0, 3) * 3 + (tracks.uv_0[..., 1] // 160).clamp(0, 2)
-    field = shared_px * torch.randn(n, 12, 2, generator=torch.Generator().manual_seed(6), dtype=D)
-    shift = field.gather(1, cell.long()[..., None].expand(-1, -1, 2))
-    fit = map_pose(samples, tracks.replace(uv_1=tracks.uv_1 + shift), *args[2:], shutter_sigma=0.0, blocks=blocks)
-    assert fit.ok.all()
-    error = se3.log(se3.compose(fit.T_1_from_0, se3.invert(T)))
-    return float((error * torch.linalg.solve(fit.cov, error)).sum(-1).mean()) / 6
-
-
-def test_blocks_of_near_tracks_enlarge_the_covariance_where_neighbours_share_their_errors():
-    assert normalised_square(0.0, (4, 2)) == pytest.approx(normalised_square(0.0, None), rel=0.3)
-    plain, widened = (normalised_square(0.5, blocks) for blocks in (None, (4, 2)))
-    assert plain > 4 and widened < 0.5 * plain, (plain, widened)
-
-
 # ------------------------------------------------------------------------------------------------ choices
 
 #: Enough steps that what is compared are optima.
@@ -211,20 +190,3 @@ def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     for share, believed in ((0.98, True), (1.02, False)):
         again = estimate_map_pose(tracks, at.T, replace(o, translation_gain=share * gain))
         assert bool(again.translates) is believed
-
-
-def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks():
-    """Unused tracks among the used ones, near ones behind far ones: the answer is that of the used ones alone."""
-    tracks, at = problem(2, 12, 20, seed=5)
-    order = torch.randperm(640, generator=torch.Generator().manual_seed(0))
-    place = lambda x: torch.cat([x] * 20, -1)[..., order] if x.shape[-1] == 32 else x  # noqa: E731
-    wide = tracks.map(place)
-    empty = order >= 32
-    wide = wide.replace(near=wide.near & ~empty, far=wide.far & ~empty)
-    plain, mixed = estimate_map_pose(tracks, at.T, FitOptions()), estimate_map_pose(wide, at.T, FitOptions())
-    torch.testing.assert_close(mixed.at.T.t, plain.at.T.t, rtol=0, atol=1e-9)
-    torch.testing.assert_close(mixed.noise[:, ~empty], plain.noise[:, order[~empty]], rtol=1e-6, atol=0)
-    noise = estimate_noise_variance(tracks, plain.at)
-    near, far = (torch.where(kind, noise, 0).amax(-1, keepdim=True) for kind in (tracks.near, tracks.far))
-    torch.testing.assert_close(plain.noise, torch.where(tracks.far, far, near), rtol=1e-9, atol=0)
-    assert (mixed.noise[:, empty] == mixed.noise[:, wide.near[0]][:, :1]).all() and (near != far).all()

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from dhtorch.geometry import patches
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES
 
 H, W = 9, 13
 #: Pixels, some of whose patches lie beyond each border and corner.
@@ -126,26 +125,6 @@ def test_reductions_are_those_of_a_loop_over_patches(how, dtype, colour, grey, m
             found = read(laid, pixels())
         for x, want in zip(found, reduced_one_by_one(image, size, grey), strict=True):
             torch.testing.assert_close(x.double(), want, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("n", [0, 64, 150])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_reductions_see_whole_lanes_of_a_few_patches_at_a_time(n, dtype, monkeypatch):
-    image = interleaved(images(dtype=dtype))
-    pixel = torch.from_numpy(np.random.default_rng(0).integers(-3, 16, (2, n, 2)).astype(np.int32))
-    seen = []
-
-    def first(p):
-        assert p.shape[:2] == (3, 3) and p.shape[2] % ELEMENTWISE_LANES == 0
-        seen.append(p.shape[2])
-        return (p[0, 0],)
-
-    (whole,) = patches.reduce_patches(image, pixel, 3, first, grey=True)
-    assert whole.shape == (2, n) and len(seen) == 1
-    monkeypatch.setattr(patches, "MAX_CHUNK_NUMBERS", 3 * 3 * 3 * 128)
-    (parts,) = patches.reduce_patches(image, pixel, 3, first, grey=True)
-    assert torch.equal(parts, whole) and max(seen[1:]) <= 128
-    assert len(seen) - 1 == max(1, -(-2 * n // 128)), "as many patches at a time as there is room for"
 
 
 def test_a_reductions_gradient_falls_on_the_pixels_it_saw():

@@ -38,17 +38,3 @@ def test_planted_errors_are_those_that_calibration_removes(capture):
     torch.testing.assert_close(calibration.camera(planted.camera).f, capture.camera.f)
     torch.testing.assert_close(calibration.depth(planted.depth)[:-1], capture.depth[1:])
     torch.testing.assert_close(calibration.vector(), torch.tensor([0.05, 0.08, 0.0]))
-
-
-def test_depth_of_a_slanted_surface_has_its_slope_as_gradient_and_edges_have_no_depth():
-    x = torch.arange(160.0)
-    plane = (2 + 0.01 * x).expand(1, 120, 160).clone()
-    plane[:, :, 120:] += 1.0
-    plane[:, :20] = 0
-    maps = example.blur_depth(plane)
-    uv = torch.tensor([[[60.3, 70.6], [30.0, 90.0], [119.5, 70.0], [60.0, 10.0], [-3.0, 60.0]]], requires_grad=True)
-    depth, surface = example.read_depth(maps, uv)
-    assert surface.tolist() == [[True, True, False, False, False]]
-    torch.testing.assert_close(depth[:, :2], 2 + 0.01 * uv[:, :2, 0], atol=1e-4, rtol=0)
-    depth[:, :2].sum().backward()
-    torch.testing.assert_close(uv.grad[:, :2], torch.tensor([[[0.01, 0.0]] * 2]), atol=1e-4, rtol=0)

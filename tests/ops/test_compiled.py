@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -242,33 +241,6 @@ def test_two_processes_may_build_at_once(tmp_path, monkeypatch):
     path = builder.build()
     assert loader.problem(path) is None and path.read_bytes() == b"whole"
     assert {*path.parent.iterdir()} == {path, loader.manifest(path)}
-
-
-def run_workers(count, folders, monkeypatch):
-    """{name of a folder: [operators, warnings, whether the answers are torch's] of each worker}, in a new process."""
-    monkeypatch.delenv("DHTORCH_OPS", raising=False)
-    program = Path(__file__).parents[1] / "support" / "library_workers.py"
-    command = [sys.executable, str(program), str(count), *map(str, folders.values())]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
-    assert done.returncode == 0, done.stderr
-    return dict(zip(folders, map(json.loads, done.stdout.splitlines()), strict=True))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked")
-def test_every_worker_of_a_loader_takes_a_sound_library_and_leaves_another(cache, tmp_path, monkeypatch):
-    names = ("sound", "changed", "cut", "foreign", "no manifest")
-    folders = {name: copy_of(cache, tmp_path / name).parent for name in names} | {"none": tmp_path / "none"}
-    folders["none"].mkdir()
-    for name in names[1:]:
-        SPOILED[name][0](folders[name] / loader.library().name)
-    found = run_workers(3, folders, monkeypatch)
-    compiled = f"compiled {loader.level()}"
-    assert found["sound"] == [[compiled, [], True]] * 3 and found["none"] == [["torch", [], True]] * 3
-    for name in names[1:]:
-        for operators, heard, same in found[name]:
-            assert operators == "torch" and same and len(heard) == 1, name
-            assert "(torch is used)" in heard[0] and loader.COMMAND in heard[0], name
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):

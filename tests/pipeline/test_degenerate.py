@@ -33,7 +33,6 @@ def test_nothing_raises_and_every_promise_is_kept(rows):
     assert all(r["n_pairs"] == N // len(KINDS) for r in rows)
     faults = {(r["name"], r["method"]): (r["faults"], r["examples"]) for r in rows if r["faults"]}
     assert not faults
-    degenerate.show(rows)
 
 
 def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):

@@ -5,12 +5,12 @@ import torch
 from support.view_estimates import random_estimates
 
 from dhtorch.codes import Gate, Hole, PoseCode
-from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Pose, PoseFit, Samples
 from dhtorch.stages.fuse import fuse_consistent
+from dhtorch.stages.triangulate import free_space_violations
 from dhtorch.synthetic.stress import open_stress
 
 #: Samples on a grid of 40 × 30 pixels: 10 of a cell of the module's own grid lie side by side.

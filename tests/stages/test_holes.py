@@ -112,15 +112,6 @@ def test_texture_at_the_limit_is_enough():
     assert torch.equal(found.flag, samples.flag) and torch.equal(found.uv, samples.uv)
 
 
-def test_texture_is_asked_for_a_hundred_thousandth_by_default():
-    """A checkerboard of contrast c has a trackability that grows with c²."""
-    frame, samples = taken([Flag.NO_DEPTH])
-    texture = float(min_eigenvalue(frame.image, samples.uv))
-    for wanted, hole in ((1.01e-5, Hole.TRACKABLE_NO_LIDAR), (0.99e-5, Hole.LOW_TEXTURE)):
-        faint = frame.replace(image=frame.image * (wanted / texture) ** 0.5)
-        assert classify(faint, samples).hole.item() == hole
-
-
 @pytest.mark.parametrize("missing", [[0, 1, 2], [0, 1], [1]])
 def test_a_point_without_a_ray_is_a_hole_whatever_its_depth(missing):
     frame, samples = taken([0, 0], usable=True)

@@ -1,4 +1,4 @@
-"""``map_pose``: accuracy with far tracks, covariance, which tracks and shutter rates are accepted, gradients."""
+"""``map_pose``: accuracy with far tracks, covariance, which tracks and shutter rates are accepted."""
 
 from dataclasses import asdict, replace
 
@@ -11,7 +11,7 @@ from support.pose_problems import map_pose_inputs
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, map_estimate, se3
-from dhtorch.records import Pose, PoseFit
+from dhtorch.records import Pose
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.triangulate import two_view
 
@@ -212,23 +212,6 @@ def test_near_tracks_that_say_nothing_of_their_depth_leave_the_pose_undetermined
     line[0, :30] = line[0, :1] + torch.linspace(0, 1, 30, dtype=D)[:, None] * torch.tensor([0.3, 0.1, 0.4], dtype=D)
     on_line = put(args, xyz=line, uv_1=args[1].uv_1)
     assert map_pose(*on_line).code[0] in (PoseCode.DEGENERATE, PoseCode.TOO_FEW)
-
-
-def test_the_start_may_come_from_another_function():
-    """From the truth instead of a search: no draws are needed, and its refusal is the answer's."""
-    args, T, *_ = map_pose_inputs(2, 20, 40)
-
-    def known(samples, tracks, camera_0, camera_1, draws):
-        zero, batch = torch.zeros(2, dtype=D), torch.zeros(2, 6, 6, dtype=D)
-        code = torch.tensor([PoseCode.OK, PoseCode.TOO_FEW], dtype=torch.int32)
-        return PoseFit(T, batch, tracks.valid, zero.long() + 5, zero, zero, zero, code)
-
-    fit = map_pose(*args, start=known)
-    assert fit.code.tolist() == [PoseCode.OK, PoseCode.TOO_FEW] and fit.n_inlier.tolist()[1] == 5
-    torch.testing.assert_close(fit.T_1_from_0.t[0], map_pose(*args).T_1_from_0.t[0], rtol=0, atol=1e-6)
-
-
-# ------------------------------------------------------------------------------------------------------ gradients
 
 
 @pytest.mark.parametrize("seed", range(3))

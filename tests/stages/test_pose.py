@@ -8,7 +8,7 @@ import torch
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Samples, Tracks
-from dhtorch.stages.pose import MAX_SEARCH_POINTS, pnp_ransac
+from dhtorch.stages.pose import pnp_ransac
 
 
 def pairs(batch, n, *, noise=0.0, outliers=0.0, planar=False, seed=0, dtype=torch.float64):
@@ -219,14 +219,6 @@ def test_the_better_of_two_hypotheses_is_kept_whichever_comes_first():
     assert rotation.max() < 0.05
 
 
-def test_many_points_are_thinned_for_the_search_only():
-    args, T = pairs(4, 4 * MAX_SEARCH_POINTS, noise=0.5, outliers=0.3, dtype=torch.float32)
-    fit = pnp_ransac(*args)
-    assert (fit.n_inlier > 2.7 * MAX_SEARCH_POINTS).all()
-    rotation, translation = errors(fit, T)
-    assert rotation.max() < 0.02 and translation.max() < 1e-3
-
-
 # -------------------------------------------------------------------------------------------------- refusals
 
 
@@ -305,6 +297,3 @@ def test_inliers_on_a_line_are_degenerate_whatever_stands_beside_it():
     fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1))
     on_line = fit.n_inlier == 30
     assert on_line.sum() >= 4 and (fit.code[on_line] == PoseCode.DEGENERATE).all()
-
-
-# ------------------------------------------------------------------------------------------ company, gradients

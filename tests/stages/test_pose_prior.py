@@ -13,7 +13,7 @@ from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, PoseFit, Samples, Tracks
 from dhtorch.stages import pose_prior
 from dhtorch.stages.pose_prior import check_pose_prior, make_prior
 from dhtorch.synthetic import SyntheticRoom
@@ -137,11 +137,6 @@ def test_a_wrong_pose_is_refuted_and_named(pairs, name):
     assert Gate.POSE_REFUTED in silent and not silent - {Gate.NO_TRACK, Gate.NO_TEXTURE, Gate.POSE_REFUTED}
 
 
-def test_poses_of_the_camera_read_as_poses_of_the_world_are_named(pairs):
-    _, fit, *_ = asked(pairs, pose_prior.relative_prior(*(se3.invert(T) for T in pairs[3])), "paper")
-    assert {conventions.CONVENTIONS[i] for i in fit.matched_convention.tolist()} == {"the inverse"}
-
-
 def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name():
     """Twice the motion, the wrong way round: read as the inverse it fits what is far away, and that is not enough."""
     camera = Camera(torch.tensor([[500.0, 500.0]]), torch.tensor([[320.0, 240.0]]))
@@ -189,28 +184,6 @@ def test_frames_may_carry_the_pose(pairs):
         method(placed[0], pairs[1].replace(T_world_from_cam=None))
     with pytest.raises(ValueError, match=r"given.sigma: found \(1,\)"):
         pose_prior.priors_from_frames(*placed, sigma=(1,))
-
-
-def test_axes_are_turned_into_ours():
-    """Forward, a turn to the left: along x and about z of a robot's camera, along z and against y of ours."""
-    turn = se3.exp(torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
-    T = Pose(turn, torch.tensor([[1.0, 0.2, 0.1]], dtype=torch.float64))
-    found = conventions.motion_from_axes(T, conventions.CAMERA_AXES["robot axes (x forward, y left, z up)"])
-    torch.testing.assert_close(found.t, torch.tensor([[-0.2, -0.1, 1.0]], dtype=torch.float64))
-    torch.testing.assert_close(se3.log(found)[0, :3], torch.tensor([0.0, -0.3, 0.0], dtype=torch.float64))
-
-
-def test_errors_of_two_poses_in_a_world_are_one_of_the_motion(pairs):
-    worlds, little = [T[:1].to(torch.float64) for T in pairs[3]], 1e-6
-    eye = torch.eye(6, dtype=torch.float64)
-    columns = []
-    for xi in little * eye:
-        moved = se3.relative(se3.compose(se3.exp(xi[None]), worlds[0]), worlds[1])
-        columns.append(se3.log(se3.compose(moved, se3.invert(se3.relative(*worlds))))[0] / little)
-    A = torch.stack(columns, 1)
-    cov = torch.diag(torch.arange(1.0, 7.0, dtype=torch.float64))[None]
-    found = conventions.relative_covariance(worlds[1], cov, 2 * cov)
-    torch.testing.assert_close(found[0], A @ (3 * cov[0]) @ A.T, rtol=1e-4, atol=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------- in samples

@@ -225,19 +225,6 @@ def test_evidence_is_the_logarithm_of_what_it_is_called():
         np.testing.assert_allclose(x[..., k][stated].numpy(), np.log(expected)[stated], rtol=1e-9, err_msg=name)
 
 
-def test_evidence_is_nothing_where_any_of_it_is_no_number():
-    estimate, samples, tracks, fit = answers()
-    for k, name in enumerate(("parallax_deg", "residual_px", "error", "photometric", "trackability")):
-        record = (estimate, estimate, tracks, tracks, samples)[k]
-        x = getattr(record, name).clone()
-        x[0, 3] = torch.nan
-        changed = {id(record): record.replace(**{name: x})}
-        stage = [changed.get(id(r), r) for r in (estimate, samples, tracks, fit)]
-        found, stated = score_features(*stage)
-        assert not stated[0, 3] and int(stated.sum()) == int(estimate.keep.sum()) - 1, name
-        assert found.isfinite().all() and (found[0, 3] == 0).all()
-
-
 # ---------------------------------------------------------------------------------------------------- learned
 
 

@@ -1,4 +1,4 @@
-"""Lucas-Kanade: known motions, OpenCV as oracle, and the house rules; number by number: test_lucas_kanade.py."""
+"""Lucas-Kanade: illumination, silent images, colours, known warps of real images; number by number: test_lucas_kanade.py."""
 
 import os
 from pathlib import Path

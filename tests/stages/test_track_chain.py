@@ -1,4 +1,4 @@
-"""Tracks through images between: what a jump loses, drift, wrong hops, lost points, covariances, gradients."""
+"""Tracks through images between: what a jump loses, wrong hops, lost points, covariances, options."""
 
 from functools import partial
 
@@ -203,22 +203,3 @@ def test_wrong_arguments():
 
 
 # --- gradients, batches ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("register", [True, False])
-@pytest.mark.parametrize("track", [lucas_kanade, pytest.param(lucas_kanade_kornia, marks=pytest.mark.slow)])
-def test_gradient_is_that_of_the_tracker(track, register):
-    images, uv = sequence(4), points(12)
-    plain = through(images, uv, track, register=register, levels=2)
-    leaf, last = uv.clone().requires_grad_(), images[-1].clone().requires_grad_()
-    chain = through([*images[:-1], last], leaf, track, register=register, levels=2)
-    assert plain.valid.all() and torch.equal(plain.valid, chain.valid)
-    assert (plain.uv_1 - chain.uv_1).abs().max() < 1e-2
-    by_point, by_image = torch.autograd.grad(chain.uv_1[..., 0].sum(), (leaf, last))
-    assert (by_point - torch.tensor([1.0, 0.0])).abs().max() < (
-        0.1 if register else 0.3
-    )  # the whole picture moves as one
-    once = track(images[0], last, uv, levels=2, hint=TrackHint(chain.uv_1.detach()))
-    (expected,) = torch.autograd.grad(once.uv_1[..., 0].sum(), last)
-    torch.testing.assert_close(by_image, expected, rtol=0.02, atol=0.02 * float(expected.abs().max()))
-    assert not any(getattr(chain, name).requires_grad for name in ("error", "photometric", "cov"))

@@ -2,7 +2,7 @@
 
 import torch
 
-from dhtorch.geometry.inference_mode import run_without_grad
+from dhtorch.geometry.determinism import run_without_grad
 
 
 def seen(x, y):
