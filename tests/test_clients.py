@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -153,16 +152,3 @@ def test_nerfstudio_says_what_the_columns_say(enriched, client):
     said = client("compare_nerfstudio", enriched / "nerfstudio", enriched / "lerobot")
     assert said["frames"] == 4 and said["largest_difference"]["depth"] <= 1e-3
     assert said["largest_difference"]["numbers"] < 1e-9
-
-
-def test_a_failure_is_said_in_one_line_without_folders(client):
-    """What becomes of a client's traceback in the table."""
-    sys.path.insert(0, str(CLIENTS))
-    try:
-        ask = importlib.import_module("all")
-    finally:
-        sys.path.remove(str(CLIENTS))
-    found, why = ask.call(sys.executable, "-c", "raise OSError('no file /tmp/some/where.txt')")
-    assert found is None and why == "OSError: no file where.txt"
-    assert ask.call(sys.executable, "-c", "print('{\"frames\": 3}')") == ({"frames": 3}, "")
-    assert len(ask.short("word " * 100)) == 160

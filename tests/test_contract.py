@@ -774,8 +774,6 @@ ELSEWHERE = {
         for name in (
             "plug_in_threshold",
             "scene_quantile_threshold",
-            "conformal_threshold",
-            "scenes_needed",
         )
     ),
     *(

@@ -13,7 +13,6 @@ from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import stack
 from dhtorch.records import SigmaBudget, depth_interval
 from dhtorch.stages.fuse import fuse_consistent, inverse_variance
-from dhtorch.stages.shared_error import _widen
 from dhtorch.synthetic import SyntheticRoom
 
 NEAR = 2.0
@@ -115,14 +114,6 @@ def test_joined_views_keep_the_proportions_and_their_disagreement_is_model(answe
     independent = inverse_variance(_views_of(answers["map"], 0.0), correlation=0.0)
     torch.testing.assert_close(total(independent.parts), independent.sigma.square(), rtol=1e-5, atol=0.0)
     assert float((independent.budget.track / independent.sigma.square())[0, 0]) == pytest.approx(0.25, abs=1e-3)
-
-
-def test_an_error_of_direction_is_lens(answers):
-    answer = answers["map"]
-    wide = _widen(answer, torch.full_like(answer.depth, 0.02))
-    keep = answer.keep
-    torch.testing.assert_close(wide.budget.lens[keep], (0.02 * answer.depth[keep]).square())
-    torch.testing.assert_close(wide.budget.track[keep], answer.budget.track[keep], rtol=1e-4, atol=1e-10)
 
 
 def test_the_interval_is_symmetric_in_inverse_depth():

@@ -148,11 +148,8 @@ def metrics_of_scenes():
     drawn = [random_points(n, seed, ties=seed % 2 == 1) for seed, n in enumerate(sizes)]
     scenes = [p.replace(score=(p.score - p.error.nan_to_num()).mul(6).round() / 6) for p in drawn[:8]] + drawn[8:]
     claimed, good, weight = reliability.pool_answers(scenes)
-    controls = [
-        (control.plug_in_threshold, {}),
-        *((control.conformal_threshold, {"confidence": c}) for c in (None, 0.5)),
-    ]
-    controls += [(control.scene_quantile_threshold, x) for x in ({}, {"share": 0.6}, {"few": 12}, {"share": 0.95})]
+    quantiles = ({}, {"share": 0.6}, {"few": 12}, {"share": 0.95})
+    controls = [(control.plug_in_threshold, {}), *((control.scene_quantile_threshold, x) for x in quantiles)]
     found = {
         "risk": [risk.measure_risk(p) for p in scenes],
         "sparsification": [risk.ause(p) for p in scenes],
@@ -174,7 +171,7 @@ def metrics_of_scenes():
             for rising in (True, False)
             for more in ({}, {"min_share": 0.15}, {"min_share": 0.3, "ends": (-2.0, 2.0)})
         ],
-        "calibration": fit_calibration(scenes, min_share=0.2, targets=(30,)),
+        "calibration": fit_calibration([p.replace(score=1.5 * p.score) for p in drawn], min_share=0.2, targets=(30,)),
         "sigma": [fit_sigma_model([p.replace(sigma=k * p.sigma) for p in scenes]) for k in (0.3, 3.0)],
     }
     return joined(found)
@@ -184,7 +181,7 @@ def held_out():
     """The truth test and the cohort of real holes on a map with steps and empty places, dense and sparse."""
     g = torch.Generator().manual_seed(7)
     empty, spread, place, chosen = torch.rand(4, 1, 60, 80, generator=g, dtype=torch.float64)
-    depth = (2 + torch.linspace(0, 2.4, 80) ** 2 / 4) * (1 + 0.02 * spread)
+    depth = (0.7 + torch.linspace(0, 2.4, 80) ** 2 / 8) * (1 + 0.02 * spread)
     depth[..., 27:] *= 1.2  # a step that the wide window alone takes for smooth
     depth = torch.where(empty > 0.995, torch.inf, torch.where(empty < 0.01, 0.0, depth))
     uv = torch.stack((170 * place.flatten(1) - 5, 130 * chosen.flatten(1) - 5), -1)[:, :600]

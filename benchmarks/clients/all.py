@@ -167,14 +167,15 @@ def loaders(target: str, known: Mapping[str, Mapping[str, str]]) -> Iterator[Loa
         yield f"{package}{version}", having, None, script
 
 
-def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path) -> list[dict[str, Any]]:
-    """One row for each target and loader of a source."""
+def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path, *more: str) -> list[dict[str, Any]]:
+    """One row for each target and loader of a source; ``more`` are options of a set with geometry images and points."""
     folder, *options = SOURCES[source]
-    start = {"source": source, "data": folder, "options": options}
+    name = f"{source}, pictures and points" if more else source
+    start = {"source": name, "data": folder, "options": [*options, *more]}
     nothing = {"opened": False, "compared": None, "step": None}
     rows = []
     for target, clients in offered.items():
-        root, why = enriched(source, target, work)
+        root, why = enriched(source, target, work, *more)
         for loader, python, compare, train in clients if not why else [("–", None, None, None)]:
             row = {**start, "target": target, "loader": loader, **nothing}
             row["why"] = why or ("" if python else "not installed")
@@ -190,24 +191,12 @@ def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path) -> li
     return rows
 
 
-def policy_rows(source: str, known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
-    """A set with geometry images and points: in openpi's transforms, and by GR00T's ``modality.json``."""
+def policy_loaders(known: Mapping[str, Mapping[str, str]]) -> list[Loader]:
+    """Those of a set with geometry images and points: openpi's transforms, and GR00T's ``modality.json``."""
     having = next((p for p, has in known.items() if "openpi_client" in has), None)
     version = "" if having is None else f" {known[having]['openpi_client']}"
     openpi = f"openpi_client{version}", having, None, "openpi_transforms.py"
-    groot: Loader = "modality.json by its fields", sys.executable, "groot_modality.py", None
-    rows = []
-    for target in ("lerobot v3.0", "lerobot v2.1"):
-        root, why = enriched(source, target, work, POLICY_COLUMNS)
-        for loader, python, compare, train in (openpi, groot):
-            row = {"source": f"{source}, pictures and points", "data": SOURCES[source][0]}
-            row |= {"options": [*SOURCES[source][1:], POLICY_COLUMNS], "target": target, "loader": loader}
-            row |= {"opened": False, "compared": None, "step": None, "why": why or ("" if python else "not installed")}
-            if python and not why:
-                row |= run_loaders(python, compare, train, root, root)
-            rows.append(row)
-    print(*map(json.dumps, rows), sep="\n", flush=True)
-    return rows
+    return [openpi, ("modality.json by its fields", sys.executable, "groot_modality.py", None)]
 
 
 def own_depth(known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
@@ -313,8 +302,9 @@ def main() -> int:
         table = []
         for some in pool.map(of, args.source or list(SOURCES)):
             table = keep(table + some, args.json)
+        policies = dict.fromkeys(("lerobot v3.0", "lerobot v2.1"), policy_loaders(known))
         for source in (source for source in POLICY_SOURCES if source in (args.source or SOURCES)):
-            table = keep(table + policy_rows(source, known, args.work or Path(folder)), args.json)
+            table = keep(table + rows(source, policies, args.work or Path(folder), POLICY_COLUMNS), args.json)
         keep(table + own_depth(known, args.work or Path(folder)), args.json)
     return 0
 

@@ -1,9 +1,12 @@
-"""Names of an enriched set's columns, read from its ``meta/info.json``."""
+"""What the clients share: names of an enriched set's columns, from its ``meta/info.json``, and one training step."""
 
 import json
 import sys
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 
 def columns(root: str, *, tables: bool = False) -> dict[str, Any]:
@@ -22,3 +25,13 @@ def columns(root: str, *, tables: bool = False) -> dict[str, Any]:
         sys.exit(f"{image} is video: found no picture in the tables, expected a loader that decodes video (LeRobot)")
     target = "action" if "action" in features else f"{camera}.T_world_from_cam"  # a hand-held camera's own motion
     return {"keys": keys, "target": target, "fps": info["fps"]}
+
+
+def train_step(tokens: Tensor, known: Any, target: Tensor, *, target_column: str, **result: Any) -> None:
+    """One step of a network that predicts the target from depth tokens; prints its loss beside the ``result``."""
+    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
+    loss = (head(tokens.flatten(1)) - target).square().mean()
+    loss.backward()
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    result |= {"target": target_column, "loss": float(loss.detach()), "tokens_known": int(known.sum())}
+    print(json.dumps(result))

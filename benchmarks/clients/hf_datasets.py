@@ -3,14 +3,13 @@
 In an environment that has datasets and dhtorch:  python benchmarks/clients/hf_datasets.py DST
 """
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import datasets
 import torch
-from columns import columns
+from columns import columns, train_step
 
 from dhtorch import ExtendDepth
 
@@ -39,12 +38,8 @@ def main(root: str) -> None:
     data.set_transform(extended)
     batch = data[:3]
     tokens, target = torch.stack(batch["observation.dh_tokens"]), torch.tensor(batch[spec["target"]])
-    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
-    loss = (head(tokens.flatten(1)) - target).square().mean()
-    loss.backward()
-    torch.optim.SGD(head.parameters(), 1e-3).step()
-    result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(torch.stack(batch["observation.dh_tokens_valid"]).sum())}))
+    known = torch.stack(batch["observation.dh_tokens_valid"])
+    train_step(tokens, known, target, frames=len(data), target_column=spec["target"])
 
 
 if __name__ == "__main__":

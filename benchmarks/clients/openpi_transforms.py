@@ -6,14 +6,13 @@ the set has one, is passed as a second camera; the resizing does not blend its c
 In an environment that has openpi-client and dhtorch:  python benchmarks/clients/openpi_transforms.py DST
 """
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from columns import columns
+from columns import columns, train_step
 from openpi_client import image_tools
 from PIL import Image
 from torch_loader import Rows
@@ -60,21 +59,17 @@ def main(root: str) -> None:
     extend = NumpyTransform(ExtendDepth(**KEYS, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56)))
     batch = stack([policy_inputs(extend(repacked(i))) for i in (GAP, GAP + 1)])
     tokens, target = torch.from_numpy(batch["depth_tokens"]), torch.from_numpy(batch["actions"])
-    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
     assert batch["image"]["base_0_rgb"].shape == (2, SIDE, SIDE, 3)
     geometry = batch["image"].get("left_wrist_0_rgb")
-    loss = (head(tokens.flatten(1)) - target).square().mean()
-    loss.backward()
-    torch.optim.SGD(head.parameters(), 1e-3).step()
-    result = {"frames": len(rows), "target": spec["target"], "loss": float(loss.detach())}
+    more = {}
     if geometry is not None:  # every code is one of the stored ones
         stored = torch.from_numpy(np.stack([repacked(i)["observation/geometry"] for i in (GAP, GAP + 1)]))
         before, resized = (
             decode_geometry_image(each.movedim(-1, 1)).depth for each in (stored, torch.from_numpy(geometry))
         )
         assert {*resized.unique().tolist()} <= {0.0, *before.unique().tolist()}
-        result["geometry_known"] = float((resized > 0).float().mean())
-    print(json.dumps(result | {"tokens_known": int(batch["depth_mask"].sum())}))
+        more["geometry_known"] = float((resized > 0).float().mean())
+    train_step(tokens, batch["depth_mask"], target, frames=len(rows), target_column=spec["target"], **more)
 
 
 if __name__ == "__main__":

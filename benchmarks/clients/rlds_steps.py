@@ -3,7 +3,6 @@
 python benchmarks/clients/rlds_steps.py SET [DEGREES FROM SIDE TO SIDE]
 """
 
-import json
 import sys
 from collections.abc import Iterator
 from itertools import islice
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from columns import train_step
 from torch.utils.data import default_collate
 
 from dhtorch import ExtendDepth
@@ -51,12 +51,9 @@ def main(root: str, fov: str | None = None) -> None:
     transform = RldsBatchTransform(model_inputs, ExtendDepth(**keys, n=256, tokens_hw=(56, 56)))
     options = {} if fov is None else {"fov": float(fov)}
     batch = default_collate([transform(step) for step in islice(steps(root, **options), GAP, GAP + 2)])
-    head = torch.nn.Linear(batch["dhtorch.tokens"][0].numel(), 7)
-    loss = (head(batch["dhtorch.tokens"].flatten(1)) - batch["action"]).square().mean()
-    loss.backward()
-    torch.optim.SGD(head.parameters(), 1e-3).step()
-    result = {"frames": sum(1 for _ in steps(root, **options)), "target": "action", "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    tokens, known = batch["dhtorch.tokens"], batch["dhtorch.tokens_valid"]
+    frames = sum(1 for _ in steps(root, **options))
+    train_step(tokens, known, batch["action"], frames=frames, target_column="action")
 
 
 if __name__ == "__main__":

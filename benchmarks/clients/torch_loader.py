@@ -4,14 +4,12 @@ python benchmarks/clients/torch_loader.py DST [WORKERS]
 """
 
 import io
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from columns import columns
+from columns import columns, train_step
 from PIL import Image
 from pyarrow import parquet
 from torch.utils.data import DataLoader, Dataset
@@ -42,15 +40,8 @@ def main(root: str, workers: str = "1") -> None:
     data = ExtendedDataset(Rows(root), transform, gap=2)
     loader = DataLoader(data, batch_size=3, num_workers=int(workers), worker_init_fn=one_thread)
     batch = next(iter(loader))
-    target = batch[spec["target"]].float()
-    head = torch.nn.Sequential(
-        torch.nn.Flatten(), torch.nn.Linear(batch["observation.dh_tokens"][0].numel(), target.shape[1])
-    )
-    loss = (head(batch["observation.dh_tokens"]) - target).square().mean()
-    loss.backward()
-    torch.optim.SGD(head.parameters(), 1e-3).step()
-    result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(batch["observation.dh_tokens_valid"].sum())}))
+    tokens, known = batch["observation.dh_tokens"], batch["observation.dh_tokens_valid"]
+    train_step(tokens, known, batch[spec["target"]].float(), frames=len(data), target_column=spec["target"])
 
 
 if __name__ == "__main__":

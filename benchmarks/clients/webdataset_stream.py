@@ -3,12 +3,10 @@
 In an environment that has webdataset and dhtorch:  python benchmarks/clients/webdataset_stream.py DST ARCHIVE.tar
 """
 
-import json
 import sys
 
-import torch
 import webdataset
-from columns import columns
+from columns import columns, train_step
 from torch.utils.data import DataLoader
 from torch_loader import Rows
 
@@ -34,12 +32,7 @@ def main(root: str, archive: str) -> None:
     transform = ExtendDepth(**places, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56))
     batch = next(iter(DataLoader(ExtendedStream(stream, transform), batch_size=2)))
     tokens, target = batch["dhtorch.tokens"], batch["target.npy"].float()
-    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
-    loss = (head(tokens.flatten(1)) - target).square().mean()
-    loss.backward()
-    torch.optim.SGD(head.parameters(), 1e-3).step()
-    result = {"frames": len(rows), "target": spec["target"], "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    train_step(tokens, batch["dhtorch.tokens_valid"], target, frames=len(rows), target_column=spec["target"])
 
 
 if __name__ == "__main__":

@@ -83,7 +83,7 @@ _ROBUST: dict[str, Any] = {"threshold_px": 2.0, "kernel": "geman_mcclure", "kern
 _UNCLEAN = Flag.DEPTH_EDGE | Flag.BORDER
 
 
-class ViewMatch(NamedTuple):
+class _ViewMatch(NamedTuple):
     """A view of the model and the frame that measures it."""
 
     view: int
@@ -103,7 +103,7 @@ class ScaleResult:
     local: LocalScales
     frame_log: np.ndarray  # (F,) log scale of every matched view, NaN where it has none
     frame_sigma: np.ndarray  # (F,)
-    matches: list[ViewMatch]  # (F,)
+    matches: list[_ViewMatch]  # (F,)
     names: list[str]  # (F,) of the views
     R: np.ndarray | None = None  # (3, 3) capture's world from model's; None = the capture has no poses
     t: np.ndarray | None = None  # (3,) m
@@ -239,7 +239,7 @@ def metric_scale(
 
 def _match_views(
     model: SceneModel, frames: Recording | Sequence[Frame], names: Sequence[str] | None, max_frames: int
-) -> tuple[list[ViewMatch], list[ViewMatch], list[str]]:
+) -> tuple[list[_ViewMatch], list[_ViewMatch], list[str]]:
     """Views with the frames that measure them, evenly spread and in the order of the frames; all such views, also those
     between; and notes.
 
@@ -248,7 +248,7 @@ def _match_views(
     """
     by_name = {Path(name).stem: k for k, name in reversed(list(enumerate(names or ())))}
     named = [(k, by_name.get(Path(view.name).stem)) for k, view in enumerate(model.views)]
-    route = sorted((ViewMatch(k, f, is_same=True) for k, f in named if f is not None), key=lambda m: m.frame)
+    route = sorted((_ViewMatch(k, f, is_same=True) for k, f in named if f is not None), key=lambda m: m.frame)
     matches = spread_evenly(route, max_frames)
     pictures = {k: view.read_picture for k, view in enumerate(model.views) if view.image is not None}
     checked = [m.view not in pictures or is_same_picture(pictures[m.view](), frames[m.frame].image) for m in matches]
@@ -264,7 +264,7 @@ def _match_views(
         )
     images = {i: lambda i=i: frames[i].image for i in spread_evenly(range(len(frames)), _FRAMES_PER_VIEW * max_frames)}
     compared = {k: pictures[k] for k in spread_evenly(list(pictures), max_frames)}
-    route = sorted((ViewMatch(*m) for m in match_pictures(compared, images)), key=lambda m: m.frame)
+    route = sorted((_ViewMatch(*m) for m in match_pictures(compared, images)), key=lambda m: m.frame)
     return route, route, []
 
 
@@ -334,8 +334,8 @@ def _poses_of(pairs: Sequence[_Pairs]) -> np.ndarray | None:
 def _compare_path(
     model: SceneModel,
     frames: Recording | Sequence[Frame],
-    route: list[ViewMatch],
-    measured: list[tuple[ViewMatch, _Pairs]],
+    route: list[_ViewMatch],
+    measured: list[tuple[_ViewMatch, _Pairs]],
     compare: Callable[..., PathScale | None],
     *,
     limit: float | None,
@@ -360,8 +360,8 @@ def _compare_path(
 def _track_motions(
     model: SceneModel,
     frames: Recording | Sequence[Frame],
-    route: list[ViewMatch],
-    measured: list[tuple[ViewMatch, _Pairs]],
+    route: list[_ViewMatch],
+    measured: list[tuple[_ViewMatch, _Pairs]],
     limit: float | None,
 ) -> CameraMotions:
     """Motions between views of a route: near returns at one of them, tracked into another."""

@@ -51,7 +51,7 @@ class CameraMotions(NamedTuple):
     cov: np.ndarray  # (P, 6, 6) of the left perturbation (rotation rad, translation m), up to a common factor
 
 
-class PathDifference(NamedTuple):
+class _PathDifference(NamedTuple):
     """A path against measured motions between its cameras."""
 
     length: float  # the path's over the measured one, if nothing else is wrong
@@ -76,7 +76,7 @@ def motions_of_path(
 def compare_motions(
     motions: CameraMotions,
     c2w: np.ndarray,  # (F, 4, 4) camera to world of the path, m
-) -> PathDifference | None:
+) -> _PathDifference | None:
     """Length, curl and single cameras of a path against measured motions.
 
     What a motion does to the image is measured well, its rotation and its translation alone are not: another length
@@ -109,7 +109,7 @@ def compare_motions(
     turned = rest[:, :3] - _times(cross, _solve(cov[:, 3:, 3:], rest[:, 3:]))
     (change, change_sigma), (angles, angle_sigma) = fits
     length = 1 / max(1 + float(change[0]), 0.1)
-    return PathDifference(
+    return _PathDifference(
         length=length,
         length_sigma=length * change_sigma,
         curl=angles,

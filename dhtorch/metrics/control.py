@@ -1,12 +1,8 @@
-"""Score thresholds that keep the error below a target: plug-in, scene-quantile and conformal risk control.
+"""Score thresholds that keep the error below a target: plug-in and scene-quantile risk control.
 
 *Plug-in* bounds the mean error of the answers on the scenes given, plus one standard error; it has no guarantee for
 another scene. *Scene quantile* requires the same of nine scenes in ten, each by itself, instead of their mean.
-*Conformal* has a guarantee: if all scenes, the next one included, are exchangeable, the loss of the next scene meets
-the target. Its loss is per candidate, capped error × answered / candidates, because it must not rise when less is
-answered. The guarantee requires a minimum number of scenes, stated in ``ScoreThreshold.needed``.
-
-All need only scores, answers and truth, so any depth source will do; ``errors.make_points`` joins arrays to a scene.
+Both need only scores, answers and truth, so any depth source will do; ``errors.make_points`` joins arrays to a scene.
 The unit is the scene: points of one scene share its truth and its poses and are not independent. Pieces of one room
 are not exchangeable scenes: join them to one first (``dhtorch.pytree.collate``).
 """
@@ -15,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
@@ -35,17 +31,6 @@ class ScoreThreshold:
     risk: float  # mean over the scenes of the control's risk, at the threshold
     coverage: float  # mean over the scenes of answered / candidates, at the threshold
     n: int  # scenes it was chosen on
-    needed: int | None = None  # fewest scenes with which a threshold can meet the target; None = no such limit
-    confidence: float | None = None
-
-    @property
-    def why(self) -> str:
-        """The result as a sentence."""
-        if self.needed is not None and self.n < self.needed:
-            return f"{self.n} scenes are too few: a target of {self.target:g} takes at least {self.needed}"
-        if self.threshold is None:
-            return f"no threshold meets {self.target:g} on these {self.n} scenes"
-        return f"score ≥ {self.threshold:.4g} answers {self.coverage:.1%} of the candidates"
 
 
 def plug_in_threshold(scenes: Sequence[Points], target: float) -> ScoreThreshold:
@@ -116,88 +101,12 @@ def scene_quantile_threshold(
     return _lowest_feasible(thresholds, fits, kept, risk, answered / sizes, target=target)
 
 
-def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> ScoreThreshold:
-    """Threshold at which the loss of the next scene meets the target, if scenes are exchangeable.
-
-    The loss of a scene is the sum of the capped errors of its answers over the number of its candidates: between 0
-    and 1, and never larger at a higher threshold. In expectation: n / (n + 1) · (mean loss) + 1 / (n + 1) ≤ target.
-    With a confidence: the Hoeffding–Bentkus p-value of "the expected loss exceeds the target" is at most
-    1 − confidence, here and at every higher threshold.
-
-    Args:
-        scenes: candidates with scores, one entry a scene; scenes without candidates are ignored.
-        target: loss allowed, in (0, 1).
-        confidence: None guarantees E(loss of the next scene) ≤ target, over the scenes here and the next one; a
-            number in (0, 1) is the probability with which the expected loss at the threshold is at most the target.
-
-    Returns:
-        ScoreThreshold with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no
-        threshold with fewer scenes. Its ``bound`` is the left side of the inequality, or the limit of the p-value.
-
-    Raises:
-        ValueError: a target or confidence outside (0, 1).
-
-    Source: A. Angelopoulos et al., "Conformal risk control", 2024; S. Bates et al., "Distribution-free,
-    risk-controlling prediction sets", 2021 (with confidence).
-    """
-    thresholds, loss, answered, sizes = _accepted_losses(scenes, target)
-    risk, n = loss / sizes, len(loss)
-    needed = scenes_needed(target, confidence=confidence)
-    # The loss does not rise with the threshold, nor do its bounds: every threshold above a feasible one is feasible.
-    if confidence is None:
-        bound = (risk.sum(0) + 1) / (n + 1)
-        fits = bound <= target
-    else:
-        bound = torch.full_like(thresholds, 1 - confidence)
-        # The largest mean loss whose p-value is small enough, up to rounding and never above.
-        low, high = 0.0, target
-        for _ in range(60):
-            middle = (low + high) / 2
-            small = _hoeffding_bentkus_p_value(middle, n, target) <= 1 - confidence
-            low, high = (middle, high) if small else (low, middle)
-        possible = _hoeffding_bentkus_p_value(0.0, n, target) <= 1 - confidence
-        fits = possible & (risk.sum(0) / max(n, 1) <= low)
-    fits = fits & (n >= needed)
-    return _lowest_feasible(
-        thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence
-    )
-
-
-def scenes_needed(target: float, *, confidence: float | None = None) -> int:
-    """Fewest scenes with which :func:`conformal_threshold` can meet a target, if all are without error.
-
-    Raises:
-        ValueError: a target or confidence outside (0, 1).
-    """
-    _check_probability("target", target)
-    if confidence is None:
-        return math.ceil(1 / target - 1 - 1e-9)
-    _check_probability("confidence", confidence)
-    return math.ceil(math.log(1 - confidence) / math.log(1 - target) - 1e-9)
-
-
-def _hoeffding_bentkus_p_value(mean: float, n: int, target: float) -> float:
-    """Hoeffding–Bentkus p-value of "the expected loss exceeds ``target``", from the mean loss of n scenes.
-
-    Losses lie in [0, 1] and are independent.
-    """
-    if mean >= target:
-        return 1.0
-    divergence = (1 - mean) * math.log((1 - mean) / (1 - target))
-    divergence += mean * math.log(mean / target) if mean > 0 else 0.0
-    # P(X ≤ k) of a binomial, summed from logarithms
-    k = math.ceil(n * mean - 1e-9)
-    whole, log, log_1 = math.lgamma(n + 1), math.log(target), math.log1p(-target)
-    terms = (whole - math.lgamma(i + 1) - math.lgamma(n - i + 1) + i * log + (n - i) * log_1 for i in range(k + 1))
-    tail = 1.0 if k >= n else min(1.0, math.fsum(math.exp(t) for t in terms))
-    return min(1.0, math.exp(-n * divergence), math.e * tail)
-
-
 def _accepted_losses(scenes: Sequence[Points], target: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Distinct scores of all answers, rising (T,): all of them, or 4096 evenly spaced ones if they are more. Of the S
     scenes with candidates the sum of the capped errors of the answers accepted at each (S, T), their number (S, T), and
     the number of candidates (S, 1)."""
-    _check_probability("target", target)
+    if not 0 < target < 1:
+        raise ValueError(f"control.target: found {target}, expected a number between 0 and 1")
     scenes = [s for s in scenes if s.keep.numel()]
     answers = [(scene.score[scene.keep].sort(), cap_error(scene.error[scene.keep])) for scene in scenes]
     thresholds = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for (score, _), _ in answers)]).unique()
@@ -215,31 +124,12 @@ def _accepted_losses(scenes: Sequence[Points], target: float) -> tuple[Tensor, T
 
 
 def _lowest_feasible(
-    thresholds: Tensor,
-    fits: Tensor,
-    bound: Tensor,
-    risk: Tensor,
-    coverage: Tensor,
-    *,
-    target: float,
-    needed: int | None = None,
-    confidence: float | None = None,
+    thresholds: Tensor, fits: Tensor, bound: Tensor, risk: Tensor, coverage: Tensor, *, target: float
 ) -> ScoreThreshold:
     """The lowest feasible threshold, which has the largest coverage; its ``threshold`` is None if none is feasible."""
     n = risk.shape[0]
-    infeasible = ScoreThreshold(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
     if not bool(fits.any()):
-        return infeasible
+        return ScoreThreshold(None, target, None, risk=0.0, coverage=0.0, n=n)
     k = int(fits.long().argmax())
-    return replace(
-        infeasible,
-        threshold=float(thresholds[k]),
-        bound=float(bound[k]),
-        risk=float(risk[:, k].mean()),
-        coverage=float(coverage[:, k].mean()),
-    )
-
-
-def _check_probability(name: str, value: float) -> None:
-    if not 0 < value < 1:
-        raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
+    means = float(risk[:, k].mean()), float(coverage[:, k].mean())
+    return ScoreThreshold(float(thresholds[k]), target, float(bound[k]), *means, n=n)

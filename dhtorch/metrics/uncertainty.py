@@ -21,7 +21,7 @@ from dhtorch.records import Estimate, depth_interval
 RANGE_BIN_RATIO = 1.25
 
 
-class RangeBias(NamedTuple):
+class _RangeBias(NamedTuple):
     """Signed error of the answers whose true depth lies in one range bin."""
 
     low: float  # m
@@ -31,7 +31,7 @@ class RangeBias(NamedTuple):
     mean: float  # mean of the same, each at most 1 in size
 
 
-def range_bias(points: Points, *, min_answers: int = 200) -> list[RangeBias]:
+def range_bias(points: Points, *, min_answers: int = 200) -> list[_RangeBias]:
     """Bias in bins of true depth with edges at powers of :data:`RANGE_BIN_RATIO` m, from near to far.
 
     Bins with fewer than ``min_answers`` answers are left out. Bins of the *estimated* depth would show a bias without
@@ -45,7 +45,7 @@ def range_bias(points: Points, *, min_answers: int = 200) -> list[RangeBias]:
         error = signed[index == k]
         if error.numel() >= min_answers:
             edges = RANGE_BIN_RATIO**k, RANGE_BIN_RATIO ** (k + 1)
-            bins.append(RangeBias(*edges, error.numel(), float(error.median()), float(error.clamp(-1, 1).mean())))
+            bins.append(_RangeBias(*edges, error.numel(), float(error.median()), float(error.clamp(-1, 1).mean())))
     return bins
 
 
@@ -73,7 +73,7 @@ def measure_uncertainty(points: Points) -> MetricValues:
     }
 
 
-class DisjointAgreement(NamedTuple):
+class _DisjointAgreement(NamedTuple):
     """Agreement of answers of the same samples from disjoint sets of source views; None without enough answers."""
 
     chi2: float | None  # mean squared difference of inverse depth over its variance: 1 where sigma is right
@@ -81,7 +81,7 @@ class DisjointAgreement(NamedTuple):
     n: int
 
 
-def disjoint_agreement(one: Estimate, other: Estimate, *, min_answers: int = 20) -> DisjointAgreement:
+def disjoint_agreement(one: Estimate, other: Estimate, *, min_answers: int = 20) -> _DisjointAgreement:
     """Reduced chi² of two estimates (B, N) of the same samples from disjoint source views.
 
     The difference of inverse depths is divided by both sigmas without their ``reference`` terms: both answers hang on
@@ -89,7 +89,7 @@ def disjoint_agreement(one: Estimate, other: Estimate, *, min_answers: int = 20)
     """
     both = one.keep & other.keep & (one.sigma > 0) & (other.sigma > 0)
     if int(both.sum()) < min_answers:
-        return DisjointAgreement(None, None, int(both.sum()))
+        return _DisjointAgreement(None, None, int(both.sum()))
     parts = []
     for estimate in (one, other):
         depth = estimate.depth[both].double()
@@ -98,4 +98,4 @@ def disjoint_agreement(one: Estimate, other: Estimate, *, min_answers: int = 20)
     (q, variance), (p, other_variance) = parts
     square = (q - p).square() / (variance + other_variance)
     # 0.45…: the square of a standard normal variable that half of the draws exceed
-    return DisjointAgreement(float(square.mean()), float(square.median()) / 0.4549364231195724, square.numel())
+    return _DisjointAgreement(float(square.mean()), float(square.median()) / 0.4549364231195724, square.numel())

@@ -345,52 +345,29 @@ def _gate(*tensors: Any, options: DenseOptions) -> tuple[Tensor, ...]:
             (B,); depth, sigma and usability of the returns (B, h, w).
         options: tuning constants.
     """
-    known, beyond, alone, pair_gate, scale_error, *returns = tensors[5:]
-    swept = _gated(known, surface.RefinedSurface(*tensors[:5]), (beyond, alone), pair_gate, options)
-    # CONTRADICTED where near returns refute the map; the metric scale's uncertainty is added to sigma.
-    depth, sigma, usable = returns
-    swept_sigma = swept.sigma.detach()
-    overlap = usable & swept.keep
-    error = (torch.where(overlap, swept.depth.detach() - depth, 0.0)).abs()
-    error_sigma = torch.where(overlap, (swept_sigma.square() + sigma.square()).sqrt(), 1.0)
-    wrong = overlap & (error > options.refuting_sigmas * error_sigma) & (error > options.refuting_ratio * depth)
-    n = overlap.sum((1, 2))
-    refuted = (n >= options.min_overlap_pixels) & (2 * wrong.sum((1, 2)) > n)
-    gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
-    by_sensor = (scale_error[:, None, None] * swept.depth.detach()).square()
-    parts = None if swept.parts is None else swept.parts.replace(reference=by_sensor)
-    swept = swept.replace(sigma=(swept_sigma.square() + by_sensor).sqrt(), gate=gate, parts=parts)
-    assert swept.parts is not None
-    return (*map_fields(swept), swept.parts.track, swept.parts.pose, swept.parts.reference)
-
-
-def _gated(
-    known: Tensor,  # (B, h, w) bool, the lens model has a ray
-    fitted: surface.RefinedSurface,
-    place: tuple[Tensor, Tensor],  # (B, h, w) bool each: nearer than the nearest plane, unique best plane
-    pair_gate: Tensor,  # (B,)
-    options: DenseOptions,
-) -> DepthMap:
-    """The swept map (B, h, w): depth, sigma and score of the fitted surface with their gates."""
-    beyond, alone = place
-    depth = 1 / fitted.q.clamp_min(MIN_SWEPT_INVERSE_DEPTH)
-    sigma_rel = (fitted.own + fitted.shared).sqrt() * depth.detach()
+    fitted = surface.RefinedSurface(*tensors[:5])
+    known, beyond, alone, pair_gate, scale_error, near_depth, near_sigma, usable = tensors[5:]
+    z = 1 / fitted.q.clamp_min(MIN_SWEPT_INVERSE_DEPTH)
+    sigma_rel = (fitted.own + fitted.shared).sqrt() * z.detach()
     untracked = ~known | ~fitted.seen | beyond | (fitted.correlation < options.min_correlation)
     uncertain = ~(sigma_rel <= options.max_sigma_rel) | ~alone
     gate = first_reason((untracked, Gate.NO_TRACK), (uncertain, Gate.UNCERTAIN))
-    pair_gate = pair_gate[:, None, None]
-    gate = torch.where(pair_gate != Gate.ANSWER, pair_gate, gate)
+    gate = torch.where(pair_gate[:, None, None] != Gate.ANSWER, pair_gate[:, None, None], gate)
     keep = gate == Gate.ANSWER
-    nan = torch.full_like(depth, torch.nan)
-    steep = depth.detach().square().square()  # m⁴, of a variance of q to one of depth
-    zero = torch.zeros_like(steep[:1, :1, :1]).expand_as(steep)  # the metric scale is added later
-    return DepthMap(
-        depth=torch.where(keep, depth, nan),
-        sigma=torch.where(keep, sigma_rel * depth.detach(), nan),
-        score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0),
-        source=keep.int() * Source.SWEPT,
-        gate=gate,
-        parts=SigmaBudget(fitted.own * steep, fitted.shared * steep, zero, zero, zero),
+    depth, sigma = (torch.where(keep, x, torch.full_like(z, torch.nan)) for x in (z, (sigma_rel * z).detach()))
+    # CONTRADICTED where near returns refute the map; the metric scale's uncertainty is added to sigma.
+    overlap = usable & keep
+    error = (torch.where(overlap, depth.detach() - near_depth, 0.0)).abs()
+    error_sigma = torch.where(overlap, (sigma.square() + near_sigma.square()).sqrt(), 1.0)
+    wrong = overlap & (error > options.refuting_sigmas * error_sigma) & (error > options.refuting_ratio * near_depth)
+    n = overlap.sum((1, 2))
+    refuted = (n >= options.min_overlap_pixels) & (2 * wrong.sum((1, 2)) > n)
+    by_sensor = (scale_error[:, None, None] * depth.detach()).square()
+    steep = z.detach().square().square()  # m⁴, of a variance of q to one of depth
+    return (
+        *(depth, (sigma.square() + by_sensor).sqrt(), torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0)),
+        *(keep.int() * Source.SWEPT, torch.where(refuted[:, None, None] & keep, Gate.CONTRADICTED, gate)),
+        *(fitted.own * steep, fitted.shared * steep, by_sensor),
     )
 
 

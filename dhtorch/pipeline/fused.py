@@ -37,13 +37,6 @@ FUSE_UNCERTAIN: Final = partial(
 )
 
 
-class FusedDepth(NamedTuple):
-    """The joint answers of B reference views, at the samples and at all pixels."""
-
-    estimate: Estimate  # (B, N)
-    depth_map: DepthMap  # (B, h, w)
-
-
 class _Answers(NamedTuple):
     """Answers of one kind at the samples, (B, N) each; where ``keep`` is False the values are 1."""
 
@@ -81,7 +74,7 @@ def fuse_with_sweep(
     half_error: float = 0.1,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,
     **changes: Any,
-) -> FusedDepth:
+) -> tuple[Estimate, DepthMap]:
     """The sweep of the selected views of B reference views, joined with their sparse answers.
 
     Args:
@@ -113,12 +106,17 @@ def fuse_with_sweep(
     options = replace(options, **changes)
     wide = replace(options, min_correlation=min_agreeing_correlation, max_sigma_rel=max_agreeing_sigma_rel)
     sweep = sweep_views(reference, selected, method, options)
-    shared_q = _shared_error(selected)
+    # Standard deviation (B, 1) in 1/m of the inverse depths of a reference view that the poses cause; 0 = unknown, as a
+    # median of few is one answer's.
+    joined = selected.joined
+    counts = joined.keep & ~selected.samples.usable & (joined.depth > 0)
+    shared = joined.sigma_shared / torch.where(counts, joined.depth, 1.0).square()
+    shared_q = torch.where(counts.sum(-1, keepdim=True) >= 9, masked_median(shared.detach(), counts), 0.0)
     swept = filter_sweep(sweep, _with_shared_error(gate_sweep(sweep, options), sweep, shared_q, half_error), options)
     uncertain = gate_sweep(sweep._replace(alone=torch.ones_like(sweep.alone)), wide)
     uncertain = _with_shared_error(uncertain, sweep, shared_q, half_error)
     at = cam.depth_pixels(reference.camera, reference.hw, None, sweep.base.hw, selected.samples.uv)
-    fused, joined = fuse_uncertain(selected.estimates), selected.joined
+    fused = fuse_uncertain(selected.estimates)
     gate = torch.where(joined.gate == Gate.UNCERTAIN, fused.gate, joined.gate)
     gate = torch.where(joined.keep, Gate.UNCERTAIN, gate)
     joint = _join(
@@ -128,17 +126,7 @@ def fuse_with_sweep(
         factors=(agreement_gain, conflict_loss),
     )
     estimate = _joint_estimate(selected, joint, half_error)
-    return FusedDepth(estimate, merge_returns(_insert(swept, at, estimate, selected, joint), sweep.returns))
-
-
-def _shared_error(selected: SelectedViews) -> Tensor:
-    """Standard deviation (B, 1) in 1/m of the inverse depths of a reference view that the poses cause; 0 = unknown."""
-    joined = selected.joined
-    counts = joined.keep & ~selected.samples.usable & (joined.depth > 0)
-    depth = torch.where(counts, joined.depth, 1.0)
-    shared = masked_median((joined.sigma_shared / depth.square()).detach(), counts)
-    # A median of fewer is one answer's.
-    return torch.where(counts.sum(-1, keepdim=True) >= 9, shared, 0.0)
+    return estimate, merge_returns(_insert(swept, at, estimate, selected, joint), sweep.returns)
 
 
 def _with_shared_error(swept: DepthMap, sweep: Sweep, shared_q: Tensor, half_error: float) -> DepthMap:

@@ -39,7 +39,7 @@ class RefinedSurface(NamedTuple):
     seen: Tensor  # bool, visible and not occluded in at least one view
 
 
-class SweptSurface(NamedTuple):
+class _SweptSurface(NamedTuple):
     """The best surface through the planes, (B, h, w) each."""
 
     q: Tensor  # 1/m, between the planes by a parabola
@@ -53,7 +53,7 @@ def sweep_planes(
     source_views: list[SourceView],
     q: Tensor,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,
-) -> SweptSurface:
+) -> _SweptSurface:
     """The surface of least census cost through the planes q (B, D) 1/m, rising from 0. Gradient: none."""
     n_views = torch.stack([source_view.use for source_view in source_views]).sum(0).clamp_min(1)
     best, aggregated = plane_sweep.aggregate_best_plane(_costs(base, source_views, q), n_views)
@@ -73,7 +73,7 @@ def sweep_planes(
     margin = plane_sweep.second_best_margin(aggregated, best, reach)
     alone = margin >= options.min_second_best_margin * n_views
     misfit = (best.cost - _unused_cost(source_views, best.cost)[:, None, None]) / n_views.to(q)
-    return SweptSurface(best_q, misfit, alone)
+    return _SweptSurface(best_q, misfit, alone)
 
 
 def _unused_cost(source_views: list[SourceView], like: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ def _costs(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: T
 def refine_surface(
     base: plane_sweep.ReferenceView,
     source_views: list[SourceView],
-    start: SweptSurface,
+    start: _SweptSurface,
     q: Tensor,
     steps: int,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,

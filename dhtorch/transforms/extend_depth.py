@@ -21,7 +21,7 @@ from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, Track
 from dhtorch.runtime.numerics import standard_numerics
 from dhtorch.transforms.layout import UNREADABLE_KEY, clear_non_finite, conform, zeros_like
 from dhtorch.transforms.maps import DenseMaps, map_to_samples
-from dhtorch.transforms.poses import pose_label, warn_refuted_poses
+from dhtorch.transforms.poses import warn_refuted_poses
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, has_key, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews, default_prefix
 from dhtorch.transforms.schema import SampleProblem, SampleResults, blank_columns, columns_of_options
@@ -230,7 +230,8 @@ class ExtendDepth(torch.nn.Module):
             columns = {column: column.compute(results) for column in columns_of_options(self._column_options())}
             added = {column.key: x for column, x in columns.items()}
             if self.views.pose is not None:
-                warn_refuted_poses(fits, paired, added["pose_convention"], pose_label(self.views.pose))
+                name = self.views.pose if isinstance(self.views.pose, str) else "pose"
+                warn_refuted_poses(fits, paired, added["pose_convention"], name)
             if flagged:
                 added = {
                     column.key: x.masked_fill(read.bad.view(-1, *[1] * (x.ndim - 1)), column.unreadable)

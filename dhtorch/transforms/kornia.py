@@ -225,7 +225,8 @@ class _Augmented:
             if isinstance(key, str):
                 values[key] = self._moved_intrinsics(key, new_hw)
         if isinstance(views.depth_intrinsics, str):
-            values[views.depth_intrinsics] = self._depth_intrinsics(cam.resize(moved, new_hw, size), size)
+            own = cam.resize(moved, new_hw, size)
+            values[views.depth_intrinsics] = self._moved_intrinsics(views.depth_intrinsics, size, own)
         if isinstance(views.distortion, str):
             values[views.distortion] = self._moved_distortion(views.distortion, camera.f)
         return replace_values(self.sample, self._poses(Q, new_hw) | values)
@@ -283,31 +284,26 @@ class _Augmented:
         """Matrices (B, k, k) as (B, 1, …, k, k) for values (B, …) whose last ``tail`` axes are one value."""
         return M.view(len(M), *(1,) * (x.ndim - 1 - tail), *M.shape[1:])
 
-    def _moved_intrinsics(self, key: str, hw: tuple[int, int]) -> Any:
-        """Intrinsics under a key, moved by A, in the form that the sample has them in."""
+    def _moved_intrinsics(self, key: str, hw: tuple[int, int], own: Camera | None = None) -> Any:
+        """Intrinsics under a key, moved by A, or those of ``own``, the moved depth map, in the form that the sample has
+        them in."""
         stored = get_value(self.sample, key)
         if is_kornia_camera(stored):
+            if own is not None:
+                return _moved_kornia(stored, own, torch.eye(3).to(own.f).expand(len(own.f), 3, 3), hw)
             camera = Camera.from_kornia(stored)
             A = self.A.to(camera.f) if len(self.A) == len(camera.f) else self.A[:1].to(camera.f).expand_as(camera.f)
             return _moved_kornia(stored, *cam.warp(camera, A), hw)
         x = self._stored(key)
         rows = intrinsic_rows(x, self.T).double()
+        if own is not None:
+            if rows.ndim != 2:
+                raise SampleError(f"{key}: found {tuple(x.shape[1:])}, expected one row of numbers or a matrix")
+            return self._returned(_with_rows(x, rows, own))
         at_f, at_c = ((0, 1), (2, 3)) if rows.shape[-1] == 4 else ((0, 4), (2, 5))
         A = self._per_value(self.A, rows, 1).expand(*rows.shape[:-1], 3, 3).flatten(0, -3)
         camera = Camera(*(rows[..., at].flatten(0, -2) for at in (at_f, at_c)))
         return self._returned(_with_rows(x, rows, cam.warp(camera, A)[0]))
-
-    def _depth_intrinsics(self, camera: Camera, hw: tuple[int, int]) -> Any:
-        """Intrinsics of the moved depth map, in the form that the sample has them in."""
-        key = str(self.views.depth_intrinsics)
-        stored = get_value(self.sample, key)
-        if is_kornia_camera(stored):
-            return _moved_kornia(stored, camera, torch.eye(3).to(camera.f).expand(len(camera.f), 3, 3), hw)
-        x = self._stored(key)
-        rows = intrinsic_rows(x, self.T).double()
-        if rows.ndim != 2:
-            raise SampleError(f"{key}: found {tuple(x.shape[1:])}, expected one row of numbers or a matrix")
-        return self._returned(_with_rows(x, rows, camera))
 
     def _moved_distortion(self, key: str, f: Tensor) -> Tensor:
         """Distortion under a key, turned with the picture."""

@@ -28,11 +28,6 @@ POSE_KINDS = ("world_from_cam", "1_from_0")
 PoseMatrix = Sequence[Sequence[float]]
 
 
-def pose_label(pose: str | PoseMatrix) -> str:
-    """Name of a pose in messages."""
-    return pose if isinstance(pose, str) else "pose"
-
-
 def check_constant_pose(pose: PoseMatrix, kind: str) -> None:
     """Check a relative pose that is the same for all samples.
 
@@ -168,7 +163,7 @@ def _read_matrix(
 
 
 def _read_pose(leaves: SampleReader, source: str | PoseMatrix, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
-    key = pose_label(source)
+    key = source if isinstance(source, str) else "pose"
     x = _read_matrix(leaves, source, T, at, ((3, 4), 4))
     R = x[:, :3, :3]
     with torch.no_grad():

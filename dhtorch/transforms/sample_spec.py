@@ -152,7 +152,8 @@ class SampleSpec:
         planes = leaves.planes(self.metric_depth_key if ready else self.depth, T, signed=False)
         depths = planes if ready else self.metres([planes])[0]
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
-        has_returns, failed = self._check_depth(depth)
+        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
+        has_returns, failed = _check_returns(depth, spec=self, low=low, high=high)
         checks += failed
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
@@ -169,8 +170,7 @@ class SampleSpec:
         reference = Frame(image, depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
         if self.sparse:
             reference = reference.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
-        other, paired = self._other(leaves, images, depths, reference, checks)
-        motion = None if other is None else self._motion(leaves, T, checks)
+        other, paired, motion = self._other(leaves, images, depths, reference, checks)
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
         return SampleViews(
             reference, other, paired, bad, has_returns=has_returns, complaints=tuple(checks), pose_prior=motion
@@ -192,7 +192,15 @@ class SampleSpec:
         if self.depth_unit == "m" and not maps[0].is_floating_point():
             raise SampleError(f"{self.depth}: found {dtype_name(maps[0])}, {EXPECTED_METRES}; is the unit mm?")
         if any(x.dtype not in (torch.int16, torch.uint16) for x in maps):
-            z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
+            z = torch.stack(list(maps)) if len(maps) > 1 else maps[0][None]
+            if not z.is_floating_point():
+                z = _to_metres(z.float(), z.dtype.is_signed, self.depth_unit)
+            elif isinstance(self.depth_unit, str):
+                z = z.nan_to_num(0.0, 0.0, 0.0).relu()
+                z = z if self.depth_unit == "m" else z / SAMPLE_UNITS_PER_METRE[self.depth_unit]
+            else:
+                z = z.nan_to_num(0.0, 0.0, 0.0).relu() * float(self.depth_unit)
+            z = clear_saturated(z, _metres_per(self.depth_unit))
         else:
             z = torch.empty(len(maps), *maps[0].shape, dtype=torch.float32, device=maps[0].device)
             for into, x in zip(z, maps, strict=True):
@@ -224,8 +232,9 @@ class SampleSpec:
 
     def _other(
         self, leaves: SampleReader, images: Tensor, depths: Tensor, reference: Frame, checks: list[Any]
-    ) -> tuple[Frame | None, Tensor]:
-        """Source views (None = none) and whether each sample has one (B,); appends to ``checks``."""
+    ) -> tuple[Frame | None, Tensor, PosePrior | None]:
+        """Source views (None = none), whether each sample has one (B,), and pose priors of the views, None without the
+        option ``pose``; appends to ``checks``."""
         T = images.shape[1]
         at = _frame_index(self.at, T, self.image)
         key = self.image if self.other_image is None else self.other_image
@@ -235,7 +244,7 @@ class SampleSpec:
         indices = [_frame_index(p, images.shape[1], key) for p in offsets]
         pad = leaves.pad(key, images.shape[1])
         if self.other_image is None and set(indices) == {at}:
-            return None, pad.new_zeros(len(pad))
+            return None, pad.new_zeros(len(pad)), None
         frames, is_own = [], []
         for p in indices:
             is_own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
@@ -251,29 +260,23 @@ class SampleSpec:
             count, when = (T, at) if shared else (images.shape[1], p)
             camera = self._camera(leaves, intrinsics, hw, count, when, checks)
             frames.append(Frame(image, depth, camera, reference.depth_camera))
-        return (frames[0] if isinstance(self.other_at, int) else stack(frames)), torch.stack(is_own).any(0)
-
-    def _motion(self, leaves: SampleReader, T: int, checks: list[Any]) -> PosePrior | None:
-        """Pose priors of the source views, None without the option ``pose``; appends to ``checks``."""
-        if self.pose is None:
-            return None
-        T_other = T if self.other_image is None else leaves.images(self.other_image, self.layout).shape[1]
-        offsets = [self.other_at] if isinstance(self.other_at, int) else self.other_at
-        indices = [_frame_index(p, T_other, self.other_image or self.image) for p in offsets]
-        unit = self.pose_unit
-        priors = read_pose_priors(
-            leaves,
-            (_frame_index(self.at, T, self.image), indices),
-            (T, T_other),
-            checks,
-            keys=(self.pose, self.other_pose),
-            cov=self.pose_cov,
-            kind=self.pose_kind,
-            axes=self.pose_axes,
-            unit=1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit,
-            refine=self.refine,
-        )
-        return priors[0] if isinstance(self.other_at, int) else priors
+        is_single = isinstance(self.other_at, int)
+        motion = None
+        if self.pose is not None:
+            priors = read_pose_priors(
+                leaves,
+                (at, indices),
+                (T, images.shape[1]),
+                checks,
+                keys=(self.pose, self.other_pose),
+                cov=self.pose_cov,
+                kind=self.pose_kind,
+                axes=self.pose_axes,
+                unit=_metres_per(self.pose_unit),
+                refine=self.refine,
+            )
+            motion = priors[0] if is_single else priors
+        return (frames[0] if is_single else stack(frames)), torch.stack(is_own).any(0), motion
 
     def _check_pose(self) -> None:
         """Raises ValueError for pose options that are invalid or contradict each other."""
@@ -296,38 +299,6 @@ class SampleSpec:
         if self.pose is not None and between_two and self.other_pose is None:
             raise ValueError("found pose and other_image, expected other_pose: the other view's pose")
         parse_pose_sigmas(self.pose_cov)
-
-    def _scaled(self, x: Tensor) -> Tensor:
-        """Depths in the data set's unit -> metres, 0 for those that mean no return."""
-        if not x.is_floating_point():
-            return clear_saturated(_to_metres(x.float(), x.dtype.is_signed, self.depth_unit), self._unit_m)
-        x = x.nan_to_num(0.0, 0.0, 0.0).relu()
-        if not isinstance(self.depth_unit, str):
-            x = x * float(self.depth_unit)
-        elif self.depth_unit != "m":
-            x = x / SAMPLE_UNITS_PER_METRE[self.depth_unit]
-        return clear_saturated(x, self._unit_m)
-
-    @property
-    def _unit_m(self) -> float:
-        unit = self.depth_unit
-        return 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
-
-    def _check_depth(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
-        """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit."""
-        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
-        return _check_returns(depth, spec=self, low=low, high=high)
-
-    def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
-        """Probed depths (B, k) -> checks of their median; none if all medians lie within the limits."""
-        median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
-        if _is_cheap_to_read(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
-            return []
-        text = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
-        return [
-            (median > self.max_depth, median, f"{text} at most {self.max_depth:g} m; are the numbers millimetres?"),
-            (median < self.min_depth, median, f"{text} at least {self.min_depth:g} m; are the numbers metres?"),
-        ]
 
     def _camera(
         self, leaves: SampleReader, numbers: KeyOrCamera, hw: tuple[int, int], T: int, at: int, checks: list[Any]
@@ -390,7 +361,8 @@ def _check_returns_kernel(depth: Tensor, *, spec: SampleSpec, low: float, high: 
 
 @operator(kernel=_check_returns_kernel, dtypes={"depth": torch.float32})
 def _check_returns(depth: Tensor, *, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
-    """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit: :meth:`SampleSpec._check_depth`."""
+    """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit; none if all medians lie within the
+    limits."""
     return _check_returns_reference(depth, spec, low, high)
 
 
@@ -399,7 +371,14 @@ def _check_returns_reference(depth: Tensor, spec: SampleSpec, low: float, high: 
     probes = depth.detach().flatten(1)[:, :: _probe_stride(depth)].contiguous()
     has_probe = (probes > 0).any(1)
     has_returns = has_probe if depth.is_cpu and all_known(has_probe) else depth.amax((1, 2)) > 0
-    return has_returns, spec._depth_checks(probes, low, high)
+    median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
+    if _is_cheap_to_read(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
+        return has_returns, []
+    text = f"{spec.depth}: the median return is {{:.4g}} m with the unit {spec.depth_unit!r}, expected"
+    return has_returns, [
+        (median > spec.max_depth, median, f"{text} at most {spec.max_depth:g} m; are the numbers millimetres?"),
+        (median < spec.min_depth, median, f"{text} at least {spec.min_depth:g} m; are the numbers metres?"),
+    ]
 
 
 def _write_metres_kernel(into: Tensor, words: Tensor, *, signed: bool, unit: str) -> None:
@@ -415,10 +394,13 @@ def _write_metres(into: Tensor, words: Tensor, *, signed: bool, unit: str | floa
     """Fill ``into`` (…) with metres, 0 = no return, from the 16-bit integers ``words`` (…), signed or unsigned."""
     _to_metres(into.copy_(words if signed else words.view(torch.uint16)), signed, unit)
     if not signed:
-        unit_m = 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
-        cleared = clear_saturated(into, unit_m)
+        cleared = clear_saturated(into, _metres_per(unit))
         if cleared is not into:
             into.copy_(cleared)
+
+
+def _metres_per(unit: str | float) -> float:
+    return 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
 
 
 def _to_metres(x: Tensor, signed: bool, unit: str | float) -> Tensor:

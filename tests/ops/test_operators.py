@@ -53,7 +53,7 @@ from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.pose import map_pose, pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.transforms import patch_tokens
+from dhtorch.transforms import patch_tokens, sample_spec
 from dhtorch.transforms.sample_spec import SampleSpec
 
 for package in ("geometry", "stages", "pipeline", "transforms"):
@@ -213,7 +213,7 @@ def depths_in_metres():
     depth[2, 31, 17], depth[4] = 1.5, 0.004
     depth[5, :, ::3] = torch.nan
     for some in ([0, 5], [0, 1], [2], [3], [4], [5], [0, 3, 4]):
-        SampleSpec(depth_unit="m")._check_depth(depth[some])
+        sample_spec._check_returns(depth[some], spec=SampleSpec(depth_unit="m"), low=0.01, high=100.0)
 
 
 def tokens():

@@ -102,16 +102,6 @@ def test_a_calibration_changes_swept_pixels_alone(views, found):
         assert torch.equal(*kept)
 
 
-def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
-    """A pose with half as much again of translation: depths in sensor's reach would be wrong by a third."""
-    fit = exact(room, 3, 11, n=512)
-    wrong = fit.replace(T_1_from_0=fit.T_1_from_0.replace(t=1.5 * fit.T_1_from_0.t))
-    with torch.no_grad():
-        got = complete_depth(views[0], views[1], fit=wrong, **FAST)
-    assert not bool((got.source == Source.SWEPT).any())
-    assert bool((got.gate[got.source == Source.NONE] != Gate.ANSWER).all())
-
-
 def test_a_batch_is_a_loop_bit_for_bit():
     torch.set_num_threads(1)
     room = SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(60, 80))

@@ -1,16 +1,14 @@
 """Between the stages: the merged map, samples without texture, precisions, draws, and tracks through lenses."""
 
-import itertools
-
 import numpy as np
 import torch
 
 from dhtorch import extend
-from dhtorch.codes import Gate, Source
+from dhtorch.codes import Gate
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pipeline.pair import merge, undistort_tracks, upcast_intrinsics
+from dhtorch.pipeline.pair import undistort_tracks, upcast_intrinsics
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
 
 HW = (20, 30)
@@ -65,26 +63,6 @@ def estimate_of(samples, gate=None, seed=23):
 
 
 # ---------------------------------------------------------------------------------------------------- the map
-
-
-def test_the_map_is_the_sensor_else_the_answer_else_nothing_in_every_field():
-    samples = samples_of(30 * rand(2, 20, 2))
-    estimate = estimate_of(samples)
-    merged = merge(samples, estimate)
-    kinds = set()
-    for b, k in itertools.product(range(2), range(20)):
-        if bool(samples.xyz[b, k].isfinite().all()):
-            expected = samples.depth, samples.sigma, samples.confidence, Source.SENSOR
-        elif estimate.gate[b, k] == Gate.ANSWER:
-            expected = estimate.depth, estimate.sigma, estimate.score, Source.RECOVERED
-        else:
-            nothing = torch.zeros(2, 20)
-            expected = nothing, nothing, nothing, Source.NONE
-        kinds.add((int(expected[3]), bool(estimate.gate[b, k] == Gate.ANSWER)))
-        for name, x in zip(("depth", "sigma", "score"), expected[:3], strict=True):
-            assert getattr(merged, name)[b, k] == x[b, k], name
-        assert merged.source[b, k] == expected[3]
-    assert len(kinds) == 4 and merged.source.dtype == torch.int32 and torch.equal(merged.uv, samples.uv)
 
 
 # ---------------------------------------------------------------------------------------------------- without texture

@@ -8,7 +8,6 @@ from dhtorch import MAP
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.experiments.compare.dense_comparison import exact_pose_fit
 from dhtorch.geometry import plane_sweep, se3
-from dhtorch.geometry.covariance import masked_median
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.dense_options import DenseOptions
@@ -68,16 +67,6 @@ def test_pixels_of_a_map_stand_for_what_they_cover(scene):
     picture, camera = dense.downscale_grey(reference, 40)
     torch.testing.assert_close(picture[0, 0, 3, 5], reference.image[0, 0, 6:8, 10:12].mean())
     torch.testing.assert_close(camera.c, (reference.camera.c + 0.5) / 2 - 0.5)
-
-
-def test_no_depth_is_surer_than_the_sensors_metre(scene):
-    reference, asked = scene
-    samples = asked.samples.replace(sigma=0.03 * asked.samples.depth)
-    share = masked_median(samples.sigma / samples.depth, samples.usable & (samples.depth > 0))
-    found = mapped((reference, asked._replace(samples=samples)))
-    told = found.source == Source.SWEPT
-    assert float(share) == pytest.approx(0.03, rel=1e-4)
-    assert bool((found.sigma[told] >= 0.0299 * found.depth[told]).all())
 
 
 def test_a_few_returns_refute_no_motion(scene):

@@ -421,12 +421,8 @@ def test_whole_numbers_of_any_width_are_read(dtype):
 
 
 def test_what_is_no_return_is_zero():
-    assert SampleSpec(depth_unit="mm")._scaled(torch.tensor([torch.inf, -torch.inf, torch.nan, 1000.0])).tolist() == [
-        0,
-        0,
-        0,
-        1,
-    ]
+    found = SampleSpec(depth_unit="mm").metres([torch.tensor([[torch.inf, -torch.inf, torch.nan, 1000.0]])])
+    assert found.tolist() == [[[0, 0, 0, 1]]]
     depth = spoiled(DEPTH, (0, slice(4)), [np.nan, np.inf, -np.inf, -1])
     for unit, scale in (("m", 1), ("mm", 1000), (0.01, 100)):
         given = depth * np.float32(scale)

@@ -98,16 +98,6 @@ def wrist(items, **options):
     return ExtendDepth(**{**keys, "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], "prefix": "dhtorch.", **options})
 
 
-def rlds_frame(items, i):
-    """A frame as RLDS hands it out: numpy, a window axis in front, bytes for text, 16-bit depth divided by 65535."""
-    window = [i - GAP, i]
-    seen = {
-        "image": np.stack([items[k]["image"] for k in window]),
-        "depth": np.stack([items[k]["depth"][..., None] for k in window]).astype(np.float32) / 65535,
-    }
-    return {"observation": seen, "task": {"language_instruction": b"look around"}, "dataset_name": b"room"}
-
-
 #: Hook -> what it makes of item GAP with the item GAP places before it, after a round trip through pickle.
 HOOKS = {
     "frames along time": lambda items, _: ExtendedDataset(LeRobot(items, deltas=[-GAP, 0]), wrist(items))[GAP],
@@ -136,7 +126,7 @@ def test_every_hook_hands_out_the_answer_of_the_transform(items, hook):
     assert isinstance(out["dhtorch.depth"], np.ndarray) == (hook == "openpi")
 
 
-def test_hooks_of_openpi_and_openvla(items):
+def test_hooks_of_openpi_and_openvla():
     given, state = sample(name="x"), torch.zeros(3)
     for hook in (NumpyTransform(tiny()), RldsBatchTransform(state_alone, tiny())):
         out = pickle.loads(pickle.dumps(hook))({**given, "state": state})
@@ -146,18 +136,6 @@ def test_hooks_of_openpi_and_openvla(items):
     for hook in (NumpyTransform, partial(RldsBatchTransform, dict)):
         with pytest.warns(UserWarning), pytest.raises(SampleError, match="skipped here: use on_error='flag'"):
             hook(tiny(on_error="skip"))({**given, "depth": "x"})
-    keys = {"image": "observation.image", "depth": "observation.depth", "intrinsics": items[0]["intrinsics"].tolist()}
-    hook = RldsBatchTransform(lambda x: {"ids": torch.arange(11)}, ExtendDepth(**keys, depth_unit=65.535, n=128))
-    out = hook(rlds_frame(items, GAP))
-    wanted = plain()({**items[GAP], "before": items[0]["image"], "index": 0})
-    assert out.keys() - {"ids"} == wanted.keys() - {*items[0], "before"} and out["dhtorch.pose_ok"]
-    assert torch.allclose(out["dhtorch.depth"], wanted["dhtorch.depth"], rtol=1e-3)
-    batch = AddedCollate(lambda rows: {"n": len(rows)})([out, hook(rlds_frame(items, GAP + 1))])
-    assert batch["n"] == 2 and batch["dhtorch.tokens"].shape == (2, 64, 10) and "ids" not in batch
-    wrong = rlds_frame(items, GAP)
-    wrong["observation"]["depth"] /= 10
-    with pytest.raises(SampleError, match=r"median return is 0\.0\d* m .* at least 0\.01 m"):
-        ExtendDepth(**keys, depth_unit="m", n=128)(wrong)
 
 
 @QUIET
