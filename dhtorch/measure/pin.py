@@ -146,7 +146,12 @@ class CameraPin:
         """
         image = image[None] if image.dim() == 3 else image
         check("CameraPin.check", image=(image, "B C H W"))
-        camera = self._live_camera(K, len(image), (image.shape[-2], image.shape[-1]))
+        if K is None:
+            K = cam.resize(self.frame.camera, self.frame.hw, (image.shape[-2], image.shape[-1]))
+        if isinstance(K, Tensor):
+            K = K[None] if K.dim() == 2 else K
+            K = cam.from_matrix(K.to(self.frame.camera.f), None if len(K) > 1 else self.frame.camera.distortion)
+        camera = K.to(self.frame.camera.f).map(lambda x: x.expand(len(image), *x.shape[1:]) if len(x) == 1 else x)
         picture = grayscale(image).to(self.frame.camera.f)
         return collate(self._check_one(picture[b : b + 1], camera[b : b + 1]) for b in range(len(image)))
 
@@ -198,14 +203,6 @@ class CameraPin:
             depth = torch.where(frames.depth > 0, frames.depth, torch.nan).nanmedian(0, keepdim=True).values
             image = frames.image.float().median(0, keepdim=True).values.to(frames.image.dtype)
             self._set_reference(self.frame.replace(image=image, depth=depth.nan_to_num(0.0)), None)
-
-    def _live_camera(self, K: Tensor | Camera | None, B: int, hw: tuple[int, int]) -> Camera:
-        if K is None:
-            K = cam.resize(self.frame.camera, self.frame.hw, hw)
-        if isinstance(K, Tensor):
-            K = K[None] if K.dim() == 2 else K
-            K = cam.from_matrix(K.to(self.frame.camera.f), None if len(K) > 1 else self.frame.camera.distortion)
-        return K.to(self.frame.camera.f).map(lambda x: x.expand(B, *x.shape[1:]) if len(x) == 1 else x)
 
     def _check_one(self, picture: Tensor, camera: Camera) -> PinResult:
         """The result (1) of one picture (1, 1, H, W)."""

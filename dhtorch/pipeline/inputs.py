@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -46,61 +46,6 @@ def validate_views(reference: Frame, others: Frame | Sequence[Frame]) -> tuple[F
         if not isinstance(frame, Frame):
             raise TypeError(f"method: {name} is a {type(frame).__name__}, expected a dhtorch.Frame")
         _check_frame(name, frame, SOURCE_FIELDS if name != "reference" else REFERENCE_FIELDS, reference.image.device)
-    reference, *views = _common_precision(frames)
-    return reference, views[0] if is_single else pytree.stack(views)
-
-
-def _check_frame(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:
-    """Raise ValueError for an empty tensor of the frame, or one on another device."""
-    for field, x in _iter_tensors(frame, fields):
-        if 0 in x.shape:
-            missing = "pixel" if 0 in x.shape[-2:] else "view"
-            raise ValueError(f"method: {name}.{field} has shape {tuple(x.shape)}, expected at least one {missing}")
-        if x.device != device:
-            raise ValueError(
-                f"method: {name}.{field} is on {x.device}, reference.image on {device}, expected one device"
-            )
-    _check_image(f"method: {name}.image", frame.image)
-    if "depth" in fields and not frame.depth.is_floating_point():
-        raise ValueError(
-            f"method: {name}.depth is {dtype_name(frame.depth)}, {EXPECTED_METRES} (of mm: depth.float() / 1000)"
-        )
-
-
-def _check_image(where: str, image: Tensor) -> None:
-    """Raise ValueError for an image of another dtype, number of channels or range; the range only where it is read
-    without waiting for a device."""
-    if image.dtype != torch.uint8 and not image.is_floating_point():
-        raise ValueError(f"{where} is {dtype_name(image)}, {EXPECTED_IMAGE}")
-    if image.ndim == 4 and image.shape[1] not in (1, 3):
-        raise ValueError(
-            f"{where} has shape {tuple(image.shape)}, expected (B C H W) with C 1 or 3 (RGBA: image[:, :3])"
-        )
-    if image.is_floating_point() and not is_static(image):
-        # 1 of 64 pixels: a check that costs nothing beside a stage.
-        largest = float(image.detach()[..., ::8, ::8].amax())
-        # Twice the range leaves room for brightness that an augmentation added; images in [0, 255] exceed it.
-        if largest > 2.0:
-            raise ValueError(f"{where} has values up to {largest:g}, {EXPECTED_RANGE}")
-
-
-def dtype_name(x: Tensor) -> str:
-    """Name of a tensor's dtype as numpy has it, such as ``uint16``."""
-    return str(x.dtype).removeprefix("torch.")
-
-
-def _iter_tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
-    """Names and tensors of the fields; of a camera its focal lengths."""
-    for field in fields:
-        value = getattr(frame, field)
-        if isinstance(value, Tensor):
-            yield field, value
-        elif isinstance(value, Camera):
-            yield f"{field}.f", value.f
-
-
-def _common_precision(frames: list[Frame]) -> list[Frame]:
-    """The frames with cameras of one dtype and images of one dtype."""
     image_dtypes, camera_dtypes = {f.image.dtype for f in frames}, {f.camera.f.dtype for f in frames}
     if len(camera_dtypes) > 1:
         dtype = _widest_dtype(camera_dtypes)
@@ -111,7 +56,48 @@ def _common_precision(frames: list[Frame]) -> list[Frame]:
             f.replace(image=f.image.to(dtype) / 255 if f.image.dtype == torch.uint8 else f.image.to(dtype))
             for f in frames
         ]
-    return frames
+    reference, *views = frames
+    return reference, views[0] if is_single else pytree.stack(views)
+
+
+def _check_frame(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:
+    """Raise ValueError for an empty tensor of the frame, one on another device, an image of another dtype, number of
+    channels or range (this only where it is read without waiting for a device), and depth of integers."""
+    for field in fields:
+        value = getattr(frame, field)
+        place, x = (f"{field}.f", value.f) if isinstance(value, Camera) else (field, value)
+        if not isinstance(x, Tensor):
+            continue
+        if 0 in x.shape:
+            missing = "pixel" if 0 in x.shape[-2:] else "view"
+            raise ValueError(f"method: {name}.{place} has shape {tuple(x.shape)}, expected at least one {missing}")
+        if x.device != device:
+            raise ValueError(
+                f"method: {name}.{place} is on {x.device}, reference.image on {device}, expected one device"
+            )
+    image = frame.image
+    if image.dtype != torch.uint8 and not image.is_floating_point():
+        raise ValueError(f"method: {name}.image is {dtype_name(image)}, {EXPECTED_IMAGE}")
+    if image.ndim == 4 and image.shape[1] not in (1, 3):
+        shape = tuple(image.shape)
+        raise ValueError(
+            f"method: {name}.image has shape {shape}, expected (B C H W) with C 1 or 3 (RGBA: image[:, :3])"
+        )
+    if image.is_floating_point() and not is_static(image):
+        # 1 of 64 pixels: a check that costs nothing beside a stage.
+        largest = float(image.detach()[..., ::8, ::8].amax())
+        # Twice the range leaves room for brightness that an augmentation added; images in [0, 255] exceed it.
+        if largest > 2.0:
+            raise ValueError(f"method: {name}.image has values up to {largest:g}, {EXPECTED_RANGE}")
+    if "depth" in fields and not frame.depth.is_floating_point():
+        raise ValueError(
+            f"method: {name}.depth is {dtype_name(frame.depth)}, {EXPECTED_METRES} (of mm: depth.float() / 1000)"
+        )
+
+
+def dtype_name(x: Tensor) -> str:
+    """Name of a tensor's dtype as numpy has it, such as ``uint16``."""
+    return str(x.dtype).removeprefix("torch.")
 
 
 def _widest_dtype(dtypes: set[torch.dtype]) -> torch.dtype:

@@ -1,15 +1,11 @@
-"""Between the stages: the merged map, samples without texture, precisions, draws, and tracks through lenses."""
+"""Between the stages: precisions of intrinsics, and tracks through lenses."""
 
 import numpy as np
 import torch
 
-from dhtorch import extend
-from dhtorch.codes import Gate
-from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3
 from dhtorch.pipeline.pair import undistort_tracks, upcast_intrinsics
-from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
+from dhtorch.records import Camera, Frame, Tracks
 
 HW = (20, 30)
 
@@ -22,23 +18,6 @@ def frame(batch=2, seed=0, dtype=torch.float64, lens=None):
     camera = Camera(torch.tensor([[40.0, 42.0]]), torch.tensor([[15.0, 9.0]]), lens)
     camera = camera.map(lambda x: x.expand(batch, -1)).to(dtype)
     return Frame(image=rand(batch, 1, *HW, seed=seed).float(), depth=1 + rand(batch, *HW, seed=seed + 1), camera=camera)
-
-
-def samples_of(uv, seed=3):
-    """Every other sample is usable."""
-    batch, n = uv.shape[:2]
-    zero = torch.zeros(batch, n, dtype=torch.float64)
-    usable = (torch.arange(n) % 2 == 0).expand(batch, n)
-    return Samples(
-        uv=uv,
-        depth=1 + rand(batch, n, seed=seed),
-        sigma=0.01 + rand(batch, n, seed=seed + 1),
-        xyz=torch.where(usable[..., None], 1.0, torch.nan).expand(batch, n, 3).double(),
-        confidence=rand(batch, n, seed=seed + 2),
-        flag=zero.int(),
-        trackability=rand(batch, n, seed=seed + 3),
-        hole=zero.int(),
-    )
 
 
 def tracks_of(uv, seed=13):
@@ -54,37 +33,10 @@ def tracks_of(uv, seed=13):
     )
 
 
-def estimate_of(samples, gate=None, seed=23):
-    shape = samples.depth.shape
-    gate = torch.randint(0, 3, shape, generator=torch.Generator().manual_seed(seed)).int() if gate is None else gate
-    columns = [torch.where(gate == 0, 1 + rand(*shape, seed=seed + k), torch.nan) for k in range(3)]
-    others = [rand(*shape, seed=seed + 3 + k) for k in range(3)]
-    return Estimate(samples.uv, *columns, others[0], others[1], 2 + 0 * gate, others[2] * (gate == 0), gate)
-
-
 # ---------------------------------------------------------------------------------------------------- the map
 
 
 # ---------------------------------------------------------------------------------------------------- without texture
-
-
-def test_a_lost_sample_without_texture_says_so():
-    """NO_TEXTURE takes the place of NO_TRACK where a track was found and only the texture is too weak."""
-    lost, usable = Gate.NO_TRACK, []
-    gate = torch.tensor([[lost] * 4 + [Gate.NO_POSE, Gate.ANSWER, lost]], dtype=torch.int32)
-    texture = torch.tensor([[0.1, 0.3, 0.1, 0.3, 0.1, 0.1, 0.2]]).double()
-    samples = samples_of(2 + 15 * rand(1, 7, 2, seed=40)).replace(trackability=texture)
-    tracks = tracks_of(samples.uv).replace(valid=torch.tensor([[True, True, False, False, True, True, True]]))
-    fit = known_pose_fit(se3.exp(rand(1, 6, seed=41)), 7)
-    stages = {"sample": lambda *_, **__: samples.uv[0], "backproject": lambda *_: samples, "verify": None}
-    stages |= {"track": lambda *_, hint: tracks, "triangulate": lambda *_: estimate_of(samples, gate)}
-    stages |= {"pose": lambda *a: usable.append(a[1].valid[0].tolist()) or fit, "score": lambda e, *_: e}
-    found = extend(frame(1), frame(1), **stages, classify=lambda *_: samples, min_trackability=0.2).gate[0]
-    assert found.tolist() == [Gate.NO_TEXTURE, lost, lost, lost, Gate.NO_POSE, Gate.ANSWER, lost]
-    assert usable[-1] == [False, True, False, False, False, False, True], "texture at the limit is enough"
-    faint = samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
-    extend(frame(1), frame(1), **stages, classify=lambda *_: faint)
-    assert usable[-1] == [True, False, False, False, True, True, True], "1e-5"
 
 
 def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():

@@ -11,9 +11,7 @@ from support.stub_samples import FixedEstimate, H, K, N, Stub, W, added, pose, s
 from torch.utils.data import default_collate
 
 import dhtorch
-from dhtorch.codes import Gate, Source
-from dhtorch.stages.backproject import backproject
-from dhtorch.stages.holes import classify
+from dhtorch.codes import Gate
 from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem
 
 QUIET = {"none": 0, "no_second_view": 0, "no_depth": 0, "unreadable": 0}
@@ -130,28 +128,6 @@ def test_a_method_is_a_name_or_a_record_and_its_networks_are_submodules():
 
 
 # ---------------------------------------------------------------------------------------------------- one view
-
-
-@pytest.mark.parametrize("alone", [{"other_image": None}, {}])
-def test_without_a_second_view_the_front_end_runs_alone(alone):
-    given = sample(before_is_pad=np.array([True]), image=sample()["image"] // 2)
-    given["depth"][:, :20] = 0
-    method = FixedEstimate()
-    extender = tiny(method, n=40, **alone)
-    mine, frame = added(extender(given)), tiny().views.read(given).reference
-    samples = classify(frame, backproject(frame, dhtorch.stages.sample.spiral(frame.hw, 40)))  # stage by stage
-    assert method.calls == 0 and mine["problem"] == ALONE
-    usable = samples.usable[0]
-    assert 5 < usable.sum() < 35
-    assert torch.equal(mine["uv"], samples.uv[0]) and torch.equal(mine["valid"], usable)
-    assert torch.equal(mine["source"], usable.int() * Source.SENSOR) and torch.equal(mine["hole"], samples.hole[0])
-    assert torch.equal(mine["flag"], samples.flag[0]) and (mine["gate"] == Gate.NO_TRACK).all()
-    for name, value in (("depth", samples.depth), ("sigma", samples.sigma), ("score", samples.confidence)):
-        assert torch.equal(mine[name], torch.where(usable, value[0], 0.0)), name
-    assert torch.allclose(mine["xyz"][usable], samples.xyz[0][usable], atol=1e-6)
-    assert not any(mine[name].any() for name in ("T_1_from_0", "pose_cov", "pose_ok", "pose_code"))
-    assert {k: v.dtype for k, v in mine.items()} == {k: v.dtype for k, v in added(tiny()(sample())).items()}
-    assert extender.report() == {**QUIET, "no_second_view": 1}
 
 
 def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
