@@ -131,18 +131,15 @@ def row(name: str, path: Path, arguments: Sequence[str], target: str, folder: Pa
     return record | {
         "frames": frames,
         "s_per_frame": max(0.0, seconds - idle) / frames,
-        "mb_per_minute": None if rate is None else sum(sizes) / 1e6 / frames * rate * 60 * cameras(source),
+        "mb_per_minute": None
+        if rate is None
+        else sum(sizes) / 1e6 / frames * rate * 60 * len({camera_key(each) for each in source}),
         "mb_per_frame": sum(sizes) / 1e6 / frames,
         "printed": [line.strip() for line in done.stdout.splitlines()[1:]],
         "done_again": again.returncode == 0 and "left untouched" in again.stdout,
         "source_untouched": digest(path) == before,
         "compared": (nerfstudio if rate is None else robot)(path, source, out),
     }
-
-
-def cameras(source: Sequence[Recording]) -> int:
-    """Cameras of an episode."""
-    return len({camera_key(each) for each in source})
 
 
 def digest(path: Path) -> str:

@@ -124,14 +124,16 @@ def upwards() -> str:
         stated = row.get("stated")
         axis = "–" if stated is None else "xyz"[max(range(3), key=lambda k: abs(stated[k]))]
         sign = "" if stated is None else "−" if sum(stated) < 0 else "+"
-        angles = (degrees(row.get(key)) for key in ("stated_from_plane_deg", "written_from_plane_deg"))
-        rows.append([f"`{row['capture']}`", sign + axis, percent(row["share"]), *angles])
+        angles = (row.get(key) for key in ("stated_from_plane_deg", "written_from_plane_deg"))
+        rows.append(
+            [
+                f"`{row['capture']}`",
+                sign + axis,
+                percent(row["share"]),
+                *("–" if a is None else f"{a:.1f}°" for a in angles),
+            ]
+        )
     return table(["capture", "stated", "level area", "stated axis from it", "`up` in the files from it"], rows)
-
-
-def degrees(value: float | None) -> str:
-    """An angle as text."""
-    return "–" if value is None else f"{value:.1f}°"
 
 
 TABLES = {"given poses": given_poses, "misread poses": partial(misread_poses, "map"), "rig poses": rig_poses}

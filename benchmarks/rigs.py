@@ -108,7 +108,8 @@ def measured(pairing: Pairing, tracker: str) -> tuple[dict[str, Any], Pose | Non
         "n_ok": int(fit.ok.sum()),
     }
     row |= {"codes": sorted({codes[int(c)] for c in fit.code}), "n_agree": agree, "ok": ok}
-    row |= {"calibrated_m": float(pairing.calibration.t.norm()), "turn_deg": turned(pairing.calibration.R)}
+    turn_deg = math.degrees(float(se3.rotation_angle(pairing.calibration.R)[0]))
+    row |= {"calibrated_m": float(pairing.calibration.t.norm()), "turn_deg": turn_deg}
     return (row | off(T, cov, pairing.calibration) | {"scale": scale}, T, cov) if ok else (row, None, None)
 
 
@@ -122,11 +123,6 @@ def off(T: Pose, cov: Tensor, calibration: Pose) -> dict[str, Any]:
     return record | {"deviation": float(covariance.mahalanobis(xi, cov.double())[0]), "z": z.tolist()}
 
 
-def turned(R: Tensor) -> float:
-    """Angle of a rotation, degrees."""
-    return math.degrees(float(se3.rotation_angle(R)[0]))
-
-
 def evaluate(estimate: Any, samples: Any, whole: Frame, near: float | None) -> errors.Points:
     """The answers whose returns were held back."""
     truth = holdout.select_candidates(samples, holdout.sample_truth(whole, samples.uv), near)
@@ -137,7 +133,9 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, tracker: st
     """Rows ``answers`` of pairs at one instant, by where the pose comes from."""
     whole, reference, others = pairing.frames()
     method = TRACKERS[tracker]
-    sources: dict[str, Any] = {"near returns": None, "calibration": calibrated(pairing)}
+    spread = torch.tensor([CALIBRATED[0] ** 2] * 3 + [CALIBRATED[1] ** 2] * 3, dtype=torch.float64)
+    calibrated = ConstantPose(pairing.calibration, torch.diag(spread)[None])
+    sources: dict[str, Any] = {"near returns": None, "calibration": calibrated}
     if pose is not None and len(pairing.references) > 1:
         sources["measured once"] = ConstantPose(pose, cov)
     for source, rigid in sources.items():
@@ -145,12 +143,6 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, tracker: st
         estimate = method.replace(pose_prior=rigid)(reference, others, hint=pairing.rig.hint, trace=trace)
         points = evaluate(estimate, trace["samples"], whole, pairing.rig.near)
         yield row(pairing, source, tracker, "space", len(pairing.references), int(trace["fit"].ok.sum()), [points])
-
-
-def calibrated(pairing: Pairing) -> ConstantPose:
-    """The calibration, for a method's ``given``."""
-    spread = [CALIBRATED[0] ** 2] * 3 + [CALIBRATED[1] ** 2] * 3
-    return ConstantPose(pairing.calibration, torch.diag(torch.tensor(spread, dtype=torch.float64))[None])
 
 
 def mixed(scene: Scene, name: str) -> dict[str, Any]:
@@ -176,22 +168,10 @@ def row(
     pairing: Pairing, source: str, tracker: str, where: str, n: int, n_ok: int, points_by_pair: list[errors.Points]
 ) -> dict[str, Any]:
     """A row ``answers``."""
-    parts = errors.measure_errors(collate_points(points_by_pair))
+    parts = errors.measure_errors(collate(points_by_pair))
     kept = ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")
     head = {"kind": "answers", "rig": pairing.name, "pose": source, "tracker": tracker, "pairs": where, "n_pairs": n}
     return head | {"n_ok": n_ok} | {k: parts[k] for k in kept}
-
-
-def collate_points(points_by_pair: list[errors.Points]) -> errors.Points:
-    """Candidates of several pairs as one list."""
-    return errors.Points(
-        *(torch.cat([getattr(p, f) for p in points_by_pair]) for f in errors.Points.__dataclass_fields__)
-    )
-
-
-def trackers() -> list[str]:
-    """Those that can be asked here."""
-    return [name for name, method in TRACKERS.items() if xfeat.method_missing_reason(method) is None]
 
 
 def main() -> int:
@@ -203,7 +183,7 @@ def main() -> int:
     records: list[Mapping[str, Any]] = []
     seen: set[int] = set()
     for pairing in pairings():
-        for tracker in trackers():
+        for tracker in (name for name, method in TRACKERS.items() if xfeat.method_missing_reason(method) is None):
             measurement, T, cov = measured(pairing, tracker)
             records += [measurement, *answers(pairing, T, cov, tracker)]
         if isinstance(pairing.rig.recording, Rig) and id(pairing.rig.recording) not in seen:

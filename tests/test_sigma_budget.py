@@ -12,7 +12,6 @@ from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import stack
 from dhtorch.records import SigmaBudget, depth_interval
-from dhtorch.stages.fuse import fuse_consistent, inverse_variance
 from dhtorch.synthetic import SyntheticRoom
 
 NEAR = 2.0
@@ -89,31 +88,6 @@ def test_of_a_calibrated_map_the_model_has_what_the_calibration_adds(answers):
     wide = model(sigma, torch.tensor([3.0]))
     parts = model.corrected_parts(SigmaBudget.single("pose", sigma.square()), sigma, wide)
     assert float(parts.pose) == pytest.approx(0.01) and float(parts.model) == pytest.approx(0.03 + 0.03**2)
-
-
-def _views_of(answer, chi: float):
-    """Two views' answers that differ by ``chi`` of their common standard deviations in inverse depth."""
-    one = answer.replace(depth=torch.full_like(answer.depth, 2.0), gate=torch.zeros_like(answer.gate))
-    parts = SigmaBudget(*(torch.full_like(answer.depth, v * 1e-4) for v in (4.0, 3.0, 2.0, 1.0, 0.0)))
-    sigma = one.depth * 0 + 1e-3**0.5
-    one = one.replace(parts=parts, sigma=sigma, sigma_shared=one.depth * 0 + 6e-4**0.5)
-    q = 0.5 + chi * 2**0.5 * float(sigma[0, 0]) / 4
-    other = one.replace(depth=torch.full_like(one.depth, 1 / q))
-    return stack([one, other])
-
-
-def test_joined_views_keep_the_proportions_and_their_disagreement_is_model(answers):
-    for fuse in (fuse_consistent, inverse_variance):
-        same = fuse(_views_of(answers["map"], 0.0))
-        shares = torch.stack([x / same.sigma.square() for x in same.budget.values()])[:, 0, 0]
-        torch.testing.assert_close(shares, torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0]), atol=1e-5, rtol=0.0)
-        apart = fuse(_views_of(answers["map"], 2.0))
-        model = (apart.budget.model / apart.sigma.square())[0, 0]
-        chi2 = 1 / (1 - float(model))
-        assert 2.5 < chi2 < 5.0, "the square of two standard deviations, each from the mean of both"
-    independent = inverse_variance(_views_of(answers["map"], 0.0), correlation=0.0)
-    torch.testing.assert_close(total(independent.parts), independent.sigma.square(), rtol=1e-5, atol=0.0)
-    assert float((independent.budget.track / independent.sigma.square())[0, 0]) == pytest.approx(0.25, abs=1e-3)
 
 
 def test_the_interval_is_symmetric_in_inverse_depth():

@@ -7,9 +7,7 @@ from support.board_scenes import Board, look
 from dhtorch import MAP
 from dhtorch.codes import Gate, Source, is_swept
 from dhtorch.experiments.compare.dense_comparison import exact_pose_fit
-from dhtorch.metrics.calibration import Calibration, SigmaModel
 from dhtorch.metrics.holdout import range_split
-from dhtorch.metrics.monotone import MonotoneTable, Sigmoid
 from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.dense import (
     sensor_depth_map,
@@ -84,22 +82,6 @@ def test_without_another_view_the_map_is_the_sensors(views):
     seen = reference.depth > 0
     assert torch.equal(got.depth[seen], reference.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
     assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
-
-
-def test_a_calibration_changes_swept_pixels_alone(views, found):
-    model = SigmaModel(2.0, 0.0)
-    table = MonotoneTable(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 0.5]))
-    sigmoid = Sigmoid(torch.tensor(1.0), torch.tensor(0.0))
-    with torch.no_grad():
-        got = complete_depth(views[0], views[1], calibration=Calibration(table, table, sigmoid, model, {}), **FAST)
-    swept = is_swept(found.source)
-    torch.testing.assert_close(got.sigma[swept], 2 * found.sigma[swept])
-    torch.testing.assert_close(got.score[swept], 0.5 * found.score[swept])
-    for name in ("depth", "source", "gate"):
-        torch.testing.assert_close(getattr(got, name), getattr(found, name), equal_nan=True)
-    for name in ("sigma", "score"):
-        kept = (getattr(x, name)[~swept].nan_to_num(-1) for x in (got, found))
-        assert torch.equal(*kept)
 
 
 def test_a_batch_is_a_loop_bit_for_bit():

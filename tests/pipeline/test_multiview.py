@@ -75,24 +75,6 @@ def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room)
     assert torch.equal(chosen.depth.nan_to_num(), few.depth.nan_to_num())
 
 
-def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace(room):
-    reference, others = room
-    searches = []
-
-    def track(image_0, image_1, uv_0, *, hint):
-        searches.append((hint, lucas_kanade(image_0, image_1, uv_0, hint=hint)))
-        return searches[-1][1]
-
-    extend_window(reference, others, track=track, **PAIR)
-    assert searches[0][0].start is None and all(hint.pyramid is searches[0][0].pyramid for hint, _ in searches)
-    for k in (1, 2):
-        last = searches[k - 1][1]
-        ahead = last.uv_0 + (last.uv_1 - last.uv_0) * (k + 1) / k
-        torch.testing.assert_close(searches[k][0].start, torch.where(last.valid[..., None], ahead, last.uv_0))
-    extend_window(reference, others, track=track, chain=False, **PAIR)
-    assert len(searches) == 6 and all(hint.start is None for hint, _ in searches[3:])
-
-
 def test_a_point_that_any_view_tracked_lacks_texture(room):
     trace = {}
     gate = extend_window(*room, min_trackability=1e9, trace=trace, **PAIR).gate
