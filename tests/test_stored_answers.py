@@ -204,6 +204,7 @@ EXTENDED = {
     "one view": ({"other_image": None}, ()),
     "lens": ({"distortion": [0.05, -0.02, 0.01, -0.01]}, ("xyz", "depth", "sigma")),
     "seed": ({"index_key": "index", "seed": 3}, ("pose_cov",)),
+    "stretch": ({"patch": 8, "tokens_hw": (64, 32)}, ("tokens", "tokens_valid")),
     "pad": ({"patch": 5, "tokens_hw": (30, 20), "fit": "pad"}, ("tokens", "tokens_valid")),
     "crop": ({"patch": 8, "tokens_hw": (64, 32), "fit": "crop"}, ("tokens", "tokens_valid")),
     "depth camera": ({"depth_intrinsics": [40.0, 42.0, 50.0, 48.0], "confidence": "conf"}, ("depth", "flag", "source")),
