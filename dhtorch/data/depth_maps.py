@@ -119,8 +119,13 @@ class DepthMaps:
         _check_shape(file, array.shape, self.hw)
         stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
         depth = clear_no_depth(stored if self.unit.metres == 1 else stored * self.unit.metres, self.unit.metres)
-        if (largest := float(depth.max())) > _MAX_DEPTH_M:
-            raise FormatError(file, "depth", f"{largest:.4g} m", f"at most {_MAX_DEPTH_M:g} m; see depth_unit")
+        files.refuse_if(
+            (largest := float(depth.max())) > _MAX_DEPTH_M,
+            file,
+            "depth",
+            f"{largest:.4g} m",
+            f"at most {_MAX_DEPTH_M:g} m; see depth_unit",
+        )
         return depth
 
 
@@ -154,8 +159,13 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
 def _open_folder(root: Path, recording: Recording, unit: str | float | None) -> DepthMaps:
     """As :func:`open_depth_maps`, of an existing folder."""
     metadata_file = root / "complete.json"
-    if unit is None and root.name == "depth" and (root.parent / "complete.json").is_file():
-        raise FormatError(root, "depth", "a part of a folder of dhtorch complete", f"{root.parent}, or depth_unit")
+    files.refuse_if(
+        unit is None and root.name == "depth" and (root.parent / "complete.json").is_file(),
+        root,
+        "depth",
+        "a part of a folder of dhtorch complete",
+        f"{root.parent}, or depth_unit",
+    )
     depth_folder = root / "depth" if (root / "depth").is_dir() else root
     candidates = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
     for file in candidates:

@@ -79,8 +79,13 @@ def parse_intrinsics(
         return ParsedIntrinsics(feature=value)
     if isinstance(value, int | float) and name != "K":
         # Horizontal field of view in degrees → fx, fy, cx, cy in px, square pixels around the image centre
-        if isinstance(value, bool) or not 1 <= value < 179:
-            raise FormatError(root, f"option {name}", value, "1 to 179 degrees, the horizontal field of view")
+        refuse_if(
+            isinstance(value, bool) or not 1 <= value < 179,
+            root,
+            f"option {name}",
+            value,
+            "1 to 179 degrees, the horizontal field of view",
+        )
         h, w = hw
         f = float(w / 2 / np.tan(np.radians(value) / 2))
         numbers = f, f, (w - 1) / 2, (h - 1) / 2

@@ -233,43 +233,12 @@ def test_episodes_are_not_told_from_the_stamps(tmp_path: Path) -> None:
     assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, two_episodes()[1][1].image)
 
 
-def rewrite_video(root: Path, pictures: list[int], stamps: list[float] | None = None) -> None:
-    """Write the colour video of episode 1 anew, with these frames at these time stamps in s."""
+def write_film(root: Path, _frames: list[Frame], *, pictures: list[int], stamps: list[float] | None = None) -> None:
+    """A set whose colour video of episode 1 has these frames at these time stamps in s."""
+    write_lerobot(root, two_episodes(), version=2, depth="tiff")
     file = root / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
     images = [two_episodes()[1][i].image[0].permute(1, 2, 0).numpy() for i in pictures]
     write_video(file, images, [i / 30 for i in range(len(images))] if stamps is None else stamps, crf=1)
-
-
-def error_of(recording: data.Recording, place: int, number: int) -> float:
-    """Mean difference in grey values of a frame's picture from that of a row, below 12 where they are one."""
-    return float((recording[place].image.float() - two_episodes()[1][number].image.float()).abs().mean())
-
-
-def test_rows_beyond_a_shorter_video_are_left_out(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
-    rewrite_video(tmp_path, [0, 1, 2])
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 1, 2] and error_of(recording, 2, 2) < 12
-    assert "row 3 has no picture in episode_000001.mp4: left out; the video ends early" in recording.report[-1]
-
-
-def test_rows_of_lost_pictures_are_left_out(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), version=2, depth="tiff")
-    rewrite_video(tmp_path, [0, 2, 3], [0, 2 / 30, 3 / 30])
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 2, 3]
-    assert recording.report[0] == "row 1 has no picture in episode_000001.mp4: left out"
-    for place, number in enumerate((0, 2, 3)):
-        assert error_of(recording, place, number) < 12
-        torch.testing.assert_close(recording[place].depth, two_episodes()[1][number].depth)
-
-
-def test_a_video_at_another_rate_with_a_frame_for_each_row_is_paired_by_order(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
-    rewrite_video(tmp_path, [0, 1, 2, 3], [i / 25 for i in range(4)])
-    recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 1, 2, 3] and max(error_of(recording, i, i) for i in range(4)) < 12
-    assert recording.report[-1].endswith("has as many frames as rows, but at other times: paired by their order")
 
 
 @pytest.mark.parametrize(
@@ -351,6 +320,15 @@ WRIST = {"dtype": "image", "shape": [*HW, 3], "info": {}}
 V2 = {"version": 2}
 
 CASES = [
+    *(set_case(name, (), {"number": numbers, "report": report, "same": (numbers, 1e-5)}, frames=SECOND,
+               write=write_film, written={"pictures": numbers, "stamps": stamps})
+      for name, numbers, stamps, report in (
+          ("rows beyond a shorter video", [0, 1, 2], None,
+           ["row 3 has no picture in episode_000001.mp4: left out; the video ends early"]),
+          ("rows of lost images", [0, 2, 3], [0, 2 / 30, 3 / 30],
+           ["^row 1 has no picture in episode_000001.mp4: left out$"]),
+          ("a video at another rate with a frame for each row", [0, 1, 2, 3], [i / 25 for i in range(4)],
+           ["has as many frames as rows, but at other times: paired by their order$"]))),
     *(set_case(f"version {version}, {image}, {depth}", (), {
         "name": f"episode_{episode:06d}/front", "report": (), "rate": 30,
         "times of": [round(i / 30, 6) for i in range(n)], "same": (list(range(n)), STEP[depth], 1.0, True)},

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from support import writers
-from support.box_scene import BOX, CAMERA, HW, check_same, disagreement, hit, off_wall, pose, render, walk, world_points
+from support.box_scene import BOX, CAMERA, HW, check_same, disagreement, hit, pose, render, walk
 from support.capture_cases import DELETE, Case, check_case
 from support.writers import parts
 
@@ -117,33 +117,6 @@ def test_a_pair_of_middlebury_2005_states_what_it_assumes(tmp_path: Path) -> Non
         data.open(tmp_path)
 
 
-def test_driving_gives_back_the_scene(tmp_path: Path) -> None:
-    frames = walk(3)
-    lidar = [se3.exp(torch.tensor([[1.0, -0.3 + 0.1 * i, 0.2, 0.1, 0.2, 0.3]]).double()) for i in range(3)]
-    lidar = Pose(torch.cat([T.R for T in lidar]), torch.cat([T.t for T in lidar]))
-    writers.write_driving(tmp_path / "one", {"FRONT": frames}, lidar)
-    recording = data.open(tmp_path / "one", hide_px=0)
-    assert recording.format == "driving" and recording.sparse and recording.name == "one/FRONT"
-    assert recording.rate_hz == pytest.approx(30, rel=1e-3)
-    torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=2e-6, rtol=0)
-    check_same(recording, frames, 1e-5)
-
-    for n, rate in ((1, None), (2, pytest.approx(30, rel=1e-3))):
-        writers.write_driving(tmp_path / f"{n} frames", {"FRONT": frames[:n]}, lidar.map(lambda x, n=n: x[:n]))
-        assert data.open(tmp_path / f"{n} frames", hide_px=0).rate_hz == rate
-    other = [render(CAMERA, pose(i + 7), HW, 100 + i / 30) for i in range(3)]
-    writers.write_driving(tmp_path / "two", {"FRONT": frames, "LEFT": other}, lidar)
-    with pytest.raises(FormatError, match=r"found 2 recordings: two/FRONT, two/LEFT, expected one"):
-        data.open(tmp_path / "two")
-    front, left = data.open_all(tmp_path / "two")
-    assert (front.name, left.name) == ("two/FRONT", "two/LEFT")
-    # A pixel may now hold the other camera's point, up to half a pixel from its centre.
-    assert float(off_wall(world_points(left[1])).max()) < 0.01
-    (cropped,) = data.open_all(tmp_path / "two", cameras=["LEFT"], crop_bottom=0.25)
-    assert cropped[0].image.shape == (1, 3, 36, 64) and torch.equal(cropped[0].depth, left[0].depth[:, :36])
-    assert torch.equal(cropped[0].camera.c, left[0].camera.c)
-
-
 # ------------------------------------------------------------------------------------------------------- recordings
 
 
@@ -232,6 +205,13 @@ def test_a_point_is_hidden_by_a_much_nearer_one_in_the_square_around_it(reach: i
 def still_driving(root: Path, frames: list[Frame]) -> None:
     lidar = Pose(torch.cat([pose(i).R for i in range(3)]), torch.cat([pose(i).t for i in range(3)]))
     writers.write_driving(root, {"FRONT": frames}, lidar)
+
+
+def write_car(root: Path, frames: list[Frame], *, both: bool = False) -> None:
+    """A scene whose LiDAR has poses of its own, with one camera or two."""
+    T = se3.exp(torch.tensor([[1.0, -0.3 + 0.1 * i, 0.2, 0.1, 0.2, 0.3] for i in range(len(frames))]).double())
+    left = {"LEFT": [render(CAMERA, pose(i + 7), HW, 100 + i / 30) for i in range(3)]} if both else {}
+    writers.write_driving(root / "one", {"FRONT": frames, **left}, T)
 
 
 def write_calib(root: Path, frames: list[Frame]) -> None:
@@ -362,6 +342,16 @@ CASES = [
     Case("an npz pair without meta.json", write_npz, stereo_pair, [("meta.json", DELETE)],
          error=r"meta.json: file: found no such file"),
     # driving
+    Case("driving", write_car, 3, (),
+         {"format": "driving", "title": "one/FRONT", "rate": pytest.approx(30, rel=1e-3), "same": ([0, 1, 2], 1e-5, 1.0, True),
+          "times": pytest.approx([100 + i / 30 for i in range(3)], abs=2e-6)}, options={"hide_px": 0}, path="one"),
+    *(Case(f"driving, {n} frames", write_car, n, (), {"rate": rate, "number": list(range(n))}, options={"hide_px": 0},
+           path="one") for n, rate in ((1, None), (2, pytest.approx(30, rel=1e-3)))),
+    *(Case(f"driving, two cameras, {name}", write_car, 3, (), {"title": f"one/{name}", "hw": HW}, which=k, path="one",
+           written={"both": True}) for k, name in enumerate(("FRONT", "LEFT"))),
+    Case("driving, one camera without the car", write_car, 3, (),
+         {"title": "one/LEFT", "hw": (36, 64), "depth hw": (36, 64), "c": CAMERA.c[0].tolist()}, path="one",
+         written={"both": True}, options={"cameras": ["LEFT"], "crop_bottom": 0.25}),
     *(Case(f"driving {message[:50]}", still_driving, 3, edits, error=message, options=options)
       for edits, options, message in (
           ([datum(1, datum={"image": {"pose": {"rotation": {"qw": None}}}})], {},

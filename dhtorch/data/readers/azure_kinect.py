@@ -199,8 +199,8 @@ def _read_calibration(file: Path, hw: tuple[int, int], depth_hw: tuple[int, int]
     entries = files.get_entry(value, "CalibrationInformation.Cameras", list, where)
     by_location = {str(entry.get("Location")): entry for entry in entries if isinstance(entry, dict)}
     locations = [f"CALIBRATION_CameraLocation{name}" for name in ("PV0", "D0")]
-    if lost := [location for location in locations if location not in by_location]:
-        raise files.FormatError(where, "Cameras", ", ".join(by_location) or "none", lost[0])
+    lost = [location for location in locations if location not in by_location]
+    files.refuse_if(lost, where, "Cameras", ", ".join(by_location) or "none", ", ".join(lost[:1]))
     colour, depth = (by_location[location] for location in locations)
     if depth_hw not in _DEPTH_MODES:
         size = f"{depth_hw[1]}x{depth_hw[0]}"

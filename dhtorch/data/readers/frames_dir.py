@@ -31,6 +31,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.readers.image_folders import (
     FrameFiles,
     FrameLoader,
+    choose_units,
     list_images,
     read_depth_type,
     read_K,
@@ -126,7 +127,9 @@ def read(
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
     other_K = _compare_with_file(root, colour_K, depth_K)  # read in any case: a file beside an option is not unread
     report += other_K if stated.K is None else []
-    units, unit = _parse_unit(units_per_metre, meta, side_car)
+    # No camera stores less than one code per metre: such a number is metres of one code, as RealSense's.
+    units, source = choose_units(root, units_per_metre, meta, side_car, _UNITS_PER_METRE)
+    units = 1 / units if units < 1 and units_per_metre is None else units
     value = fps if fps is not None else meta.get("fps")
     rate = None if value is None or isinstance(value, str) else files.to_positive(value, side_car, "fps")
     no_return = invalid if invalid is not None else meta.get("invalid", NO_DEPTH_CODES)
@@ -163,7 +166,7 @@ def read(
             poses=poses,
             rate_hz=rate,
             report=(*report, *stated.report),
-            depth_unit=unit,
+            depth_unit=DepthUnit(1 / units, source),
             stored=stored,
         )
     ]
@@ -302,16 +305,3 @@ def _compare_with_file(root: Path, *used: tuple[object, Path, str] | None) -> li
     return [
         f"{file.name} states another K than the one in use: f {stated[0, 0]:g}, c {stated[0, 2]:g} {stated[1, 2]:g}"
     ]
-
-
-def _parse_unit(option: float | None, meta: dict[str, object], side_car: Path) -> tuple[float, DepthUnit]:
-    """(depth codes of one metre, the unit with what states it) from the option, else the side-car, else assumed."""
-    if option is not None:
-        units, source = files.to_positive(option, side_car, "option units_per_metre"), "option units_per_metre"
-        return units, DepthUnit(1 / units, source)
-    if "depth_scale" not in meta:
-        return _UNITS_PER_METRE, DepthUnit(1 / _UNITS_PER_METRE)
-    scale, source = files.to_positive(meta["depth_scale"], side_car, "depth_scale"), "meta.json: depth_scale"
-    # No camera stores less than one code per metre: such a number is metres of one code, as RealSense's.
-    units = scale if scale >= 1 else 1 / scale
-    return units, DepthUnit(1 / units, source)

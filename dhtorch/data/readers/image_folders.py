@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -541,7 +542,23 @@ def read_pose(file: Path) -> np.ndarray:
     return matrix
 
 
-# ---------------------------------------------------------------------------------------------------------- cameras
+# ------------------------------------------------------------------------------------------------- units and cameras
+
+
+def choose_units(
+    root: Path,
+    option: float | None,
+    document: Mapping[str, Any],
+    file: Path | None,
+    usual: float,
+    source: str | None = None,
+) -> tuple[float, str | None]:
+    """(depth codes of one metre, what states it): the option, else ``depth_scale`` of a file, else the usual number."""
+    if option is not None:
+        return files.to_positive(option, root, "option units_per_metre"), "option units_per_metre"
+    if file is None or "depth_scale" not in document:
+        return usual, source
+    return files.to_positive(document["depth_scale"], file, "depth_scale"), f"{file.name}: depth_scale"
 
 
 def _fit_camera(stated: StatedK, hw: tuple[int, int]) -> tuple[Camera, tuple[str, ...]]:

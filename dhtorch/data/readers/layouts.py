@@ -67,6 +67,7 @@ from dhtorch.data.readers.image_folders import (
     FrameFiles,
     StatedK,
     choose_rotated_bits,
+    choose_units,
     first_file,
     first_image_folder,
     list_images,
@@ -215,8 +216,9 @@ def _list_replica(root: Path, place: tuple[dict[int, Path], dict[int, Path], Pat
     if file is not None:
         document = files.read_json(file)
         camera = document.get("camera", document)
-        if not isinstance(camera, dict):
-            raise files.FormatError(file, "camera", camera, "an object with w, h, fx, fy, cx, cy and scale")
+        files.refuse_if(
+            not isinstance(camera, dict), file, "camera", camera, "an object with w, h, fx, fy, cx, cy and scale"
+        )
         if "fx" in camera:
             values = files.to_array(
                 [camera.get(name) for name in ("fx", "fy", "cx", "cy")], (4,), file, "fx, fy, cx, cy"
@@ -413,11 +415,7 @@ def _list_open3d(
         h, w = (document.get(name) for name in ("height", "width"))
         hw = (h, w) if isinstance(h, int) and isinstance(w, int) and min(h, w) > 0 else None
         stated = (matrix, file, field, hw)
-    units, source = 1000.0, None  # Open3D's default
-    if units_per_metre is not None:
-        units, source = files.to_positive(units_per_metre, root, "option units_per_metre"), "option units_per_metre"
-    elif file is not None and "depth_scale" in document:
-        units, source = files.to_positive(document["depth_scale"], file, "depth_scale"), f"{file.name}: depth_scale"
+    units, source = choose_units(root, units_per_metre, document, file, 1000.0)  # Open3D's default
     return [FolderParts(rows, stated, "camera_intrinsic.json", units, source, poses_file, report)]
 
 

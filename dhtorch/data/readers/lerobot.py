@@ -355,8 +355,7 @@ def _read_cameras(
     (K_depth, distortion), root, hw = options, meta.root, meta.features[key].hw
     side_car = root / "meta" / "intrinsics.json"
     entry = files.read_json(side_car).get(key, {}) if side_car.is_file() else {}
-    if not isinstance(entry, dict):
-        raise files.FormatError(side_car, key, type(entry).__name__, "an object with K")
+    files.refuse_if(not isinstance(entry, dict), side_car, key, type(entry).__name__, "an object with K")
     distortion = distortion if distortion is not None else entry.get("dist")
     depth_camera = None
     if depth is not None and (K_depth is not None or entry.get("K_depth") is not None):

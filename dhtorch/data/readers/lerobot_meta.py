@@ -131,8 +131,7 @@ def read_lerobot_meta(root: Path) -> LeRobotMeta:
     templates = {"data_path": (_V2_DATA, _V3_DATA), "video_path": (_V2_VIDEO, _V3_VIDEO)}
     paths = {key: info.get(key) or defaults[number - 2] for key, defaults in templates.items()}
     for key, value in paths.items():
-        if not isinstance(value, str):
-            raise files.FormatError(file, key, type(value).__name__, "a path")
+        files.refuse_if(not isinstance(value, str), file, key, type(value).__name__, "a path")
     features = files.get_entry(info, "features", dict, file)
     return LeRobotMeta(
         root=root,
@@ -231,8 +230,13 @@ def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> 
 
     def fill(match: re.Match[str]) -> str:
         name, width = match[1], match[2]
-        if name not in values or (width and isinstance(values[name], str)):
-            raise files.FormatError(file, key, match[0], f"one of {', '.join(values)}")
+        files.refuse_if(
+            name not in values or (width and isinstance(values[name], str)),
+            file,
+            key,
+            match[0],
+            f"one of {', '.join(values)}",
+        )
         return str(values[name]).zfill(int(width or 0))
 
     name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
@@ -243,12 +247,15 @@ def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> 
 def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
     dtype = files.get_entry(value, "dtype", str, file)
     shape = value.get("shape") or ()
-    if (
+    files.refuse_if(
         not isinstance(shape, list | tuple)
         or len(shape) > 8
-        or any(type(n) is not int or not 0 <= n < 2**31 for n in shape)
-    ):
-        raise files.FormatError(file, f"features.{key}.shape", shape, "a few counts")
+        or any(type(n) is not int or not 0 <= n < 2**31 for n in shape),
+        file,
+        f"features.{key}.shape",
+        shape,
+        "a few counts",
+    )
     files.refuse_if(
         dtype in ("video", "image") and (len(shape) not in (2, 3) or not 0 < math.prod(shape) <= 4 * files.MAX_PIXELS),
         file,
@@ -257,8 +264,13 @@ def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
         "height, width and channels",
     )
     info = value.get("info") or value.get("video_info") or {}
-    if not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."):
-        raise files.FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")
+    files.refuse_if(
+        not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."),
+        file,
+        f"features.{key}",
+        type(info).__name__,
+        "an object under a plain name",
+    )
     return LeRobotFeature(key, dtype, tuple(shape), info)
 
 
@@ -268,8 +280,13 @@ def _check_counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODE
 
 def _check_numbers(values: Any, file: Path, field: str, is_valid: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """A column (n,) as float64, after checking that all values are numbers and valid."""
-    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
-        raise files.FormatError(file, field, "no numbers", "one number per row")
+    files.refuse_if(
+        not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu",
+        file,
+        field,
+        "no numbers",
+        "one number per row",
+    )
     column = values.astype(np.float64)
     if not (valid := is_valid(column)).all():
         raise files.FormatError(file, field, column[~valid][0], "a count, or a time in s")

@@ -130,13 +130,11 @@ def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[byt
         FormatError: no image in that cell, or a missing file.
     """
     cell = read_cell(table, key, row)
-    if not isinstance(cell, dict):
-        raise files.FormatError(table, key, type(cell).__name__, "an image: bytes and path")
+    files.refuse_if(not isinstance(cell, dict), table, key, type(cell).__name__, "an image: bytes and path")
     data, path = cell.get("bytes"), cell.get("path")
     if isinstance(data, bytes) and data:
         return data, table
-    if not isinstance(path, str):
-        raise files.FormatError(table, key, "neither bytes nor path", "an image")
+    files.refuse_if(not isinstance(path, str), table, key, "neither bytes nor path", "an image")
     file = files.resolve_inside(root, path, table, key)
     return files.read_bytes(file), file
 

@@ -79,8 +79,7 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     rows: dict[PurePosixPath, list[FrameFiles]] = {}
     missing: list[Path] = []
     for k, entry in enumerate(files.get_entry(meta, "frames", list, file)):
-        if not isinstance(entry, dict):
-            raise files.FormatError(file, f"frames.{k}", type(entry).__name__, "an object")
+        files.refuse_if(not isinstance(entry, dict), file, f"frames.{k}", type(entry).__name__, "an object")
         image = resolve_image(folder, entry, file, k)
         if not image.is_file():
             missing.append(image)
@@ -176,10 +175,13 @@ def parse_lens(
         expected = f"{', '.join(_PERSPECTIVE_MODELS)} (undistort other lenses first)"
         raise files.FormatError(file, f"frames.{k}.camera_model", actual, expected)
     lens = tuple(_number(values, name, file, k, 0.0) for name in _LENS_NAMES)
-    if k4 := _number(values, "k4", file, k, 0.0):
-        raise files.FormatError(
-            file, f"frames.{k}.k4", k4, "0 (OpenCV's model has no term in r⁸; undistort the images)"
-        )
+    files.refuse_if(
+        k4 := _number(values, "k4", file, k, 0.0),
+        file,
+        f"frames.{k}.k4",
+        k4,
+        "0 (OpenCV's model has no term in r⁸; undistort the images)",
+    )
     hw = None
     if "w" in values and "h" in values:  # the size that K refers to
         h, w = (files.to_positive(values[name], file, f"frames.{k}.{name}") for name in "hw")

@@ -222,8 +222,7 @@ def _load_frame(
 def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
     file = table.path
     value = files.decode_json(table.read(), file)
-    if not isinstance(value, dict):
-        raise files.FormatError(file, "JSON", type(value).__name__, "an object")
+    files.refuse_if(not isinstance(value, dict), file, "JSON", type(value).__name__, "an object")
     hw = _parse_size(value, "h", "w", file)
     if hw is None:
         raise files.FormatError(file, "w, h", "nothing", "the size of the images")

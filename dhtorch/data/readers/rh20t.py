@@ -97,8 +97,13 @@ def read(
     root = Path(root)
     meta = files.read_json(root / "metadata.json")
     stamp = meta.get("calib", -1)
-    if isinstance(stamp, bool) or not isinstance(stamp, int | str) or not re.fullmatch(r"\d{10,16}", str(stamp)):
-        raise files.FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = none)")
+    files.refuse_if(
+        isinstance(stamp, bool) or not isinstance(stamp, int | str) or not re.fullmatch(r"\d{10,16}", str(stamp)),
+        root / "metadata.json",
+        "calib",
+        stamp,
+        "the stamp of a calibration (-1 = none)",
+    )
     parent = root.parent.parent if root.parent.name == "action" else root.parent
     folder = (Path(calibration) if calibration is not None else parent / "calib") / str(stamp)
     hw = files.to_array(calibrated_hw, (2,), root, "option calibrated_hw")
@@ -115,8 +120,13 @@ def read(
         outlier=outlier,
     )
     present = sorted(d.name[4:] for d in root.glob("cam_*") if d.is_dir())
-    if unknown := sorted(set(serials or ()) - set(present)):
-        raise files.FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
+    files.refuse_if(
+        unknown := sorted(set(serials or ()) - set(present)),
+        root,
+        "option serials",
+        ", ".join(unknown),
+        f"some of {', '.join(present)}",
+    )
     incomplete = {} if serials else {s: reason for s in present if (reason := rig.lacks(s))}
     opened = [s for s in serials or present if s not in incomplete]
     files.refuse_if(
@@ -244,9 +254,14 @@ class _SceneCameras:
         """World → camera (4, 4): the first of a camera's matrices."""
         file = self.folder / "extrinsics.npy"
         value = self.E.get(serial)
-        first = value[0] if isinstance(value, list | np.ndarray) and len(value) else None
-        if not isinstance(first, np.ndarray) or first.shape != (4, 4) or first.dtype.kind != "f":
-            raise files.FormatError(file, serial, type(first).__name__, "a list of 4x4 matrices")
+        first: Any = value[0] if isinstance(value, list | np.ndarray) and len(value) else None
+        files.refuse_if(
+            not isinstance(first, np.ndarray) or first.shape != (4, 4) or first.dtype.kind != "f",
+            file,
+            serial,
+            type(first).__name__,
+            "a list of 4x4 matrices",
+        )
         convert.to_poses(first[None].astype(np.float64), file, serial)
         return first.astype(np.float64)
 
@@ -310,8 +325,13 @@ class _SceneCameras:
 
 
 def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> RobotArm | None:
-    if configuration is not None and configuration not in ROBOT_ARMS:
-        raise files.FormatError(root, "option configuration", configuration, "1 to 7")
+    files.refuse_if(
+        configuration is not None and configuration not in ROBOT_ARMS,
+        root,
+        "option configuration",
+        configuration,
+        "1 to 7",
+    )
     match = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
     number = configuration or (int(match[1]) if match else None)
     if number is None:
@@ -321,18 +341,18 @@ def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | No
 
 def _read_by_serial(file: Path) -> dict[str, Any]:
     value = read_npy(file)
-    if not isinstance(value, dict):
-        raise files.FormatError(file, "content", type(value).__name__, "a dict by camera serial")
+    files.refuse_if(not isinstance(value, dict), file, "content", type(value).__name__, "a dict by camera serial")
     return {str(key): entry for key, entry in value.items()}
 
 
 def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list[tuple[int, float]]:
     """(frame index, time in s) of the video's frames, strictly increasing in time."""
-    stamps = lists.get(kind) if isinstance(lists, dict) else None
+    stamps: Any = lists.get(kind) if isinstance(lists, dict) else None
     if isinstance(stamps, np.ndarray):
         stamps = stamps.tolist()
-    if not isinstance(stamps, list) or not stamps:
-        raise files.FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
+    files.refuse_if(
+        not isinstance(stamps, list) or not stamps, file, kind, type(stamps).__name__, "a list of Unix milliseconds"
+    )
     if len(stamps) != n:
         counts = f"{format_count(len(stamps), f'{kind} stamp')} for {format_count(n, 'frame')}"
         notes.append(f"{counts}: the first {min(n, len(stamps))} are used")

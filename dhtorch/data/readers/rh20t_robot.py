@@ -214,17 +214,22 @@ def _read_field_streams(file: Path, field: str, name: str, width: int | None) ->
 def _iter_entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
     """(time in s, values) of the entries with the field; without non-finite values and zero poses."""
     for entries in lists:
-        if not isinstance(entries, list):
-            raise files.FormatError(file, "entries", type(entries).__name__, "a list for each camera")
+        files.refuse_if(
+            not isinstance(entries, list), file, "entries", type(entries).__name__, "a list for each camera"
+        )
         for entry in entries:
-            if not isinstance(entry, dict) or "timestamp" not in entry:
-                raise files.FormatError(file, "entries", "something else", "objects with a timestamp")
+            files.refuse_if(
+                not isinstance(entry, dict) or "timestamp" not in entry,
+                file,
+                "entries",
+                "something else",
+                "objects with a timestamp",
+            )
             time, value = ms_to_seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
             if value is None:
                 continue
             value = _parse_vector(value, file, field)
-            if width is not None and len(value) != width:
-                raise files.FormatError(file, field, f"{len(value)} numbers", width)
+            files.refuse_if(width is not None and len(value) != width, file, field, f"{len(value)} numbers", width)
             if np.isfinite(value).all() and (field != "tcp" or np.linalg.norm(value[3:]) > 1e-6):
                 yield time, value
 
@@ -247,6 +252,5 @@ def _parse_vector(value: Any, file: Path, field: str) -> np.ndarray:
 
 def _check_mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
     """Checked dict; with ``texts`` its keys as strings, since a serial may be stored as a number."""
-    if not isinstance(value, dict):
-        raise files.FormatError(file, field, type(value).__name__, "a dict")
+    files.refuse_if(not isinstance(value, dict), file, field, type(value).__name__, "a dict")
     return {str(key): entry for key, entry in value.items()} if texts else value

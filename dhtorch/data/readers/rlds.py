@@ -98,8 +98,13 @@ def read(
     _flatten(nodes, "", features, file, 0)
 
     def find(key: str, option: str, chosen: str | None, *names: str) -> str | None:
-        if chosen is not None and chosen not in features:
-            raise files.FormatError(root, f"option {option}", chosen, f"one of {', '.join(features)}")
+        files.refuse_if(
+            chosen is not None and chosen not in features,
+            root,
+            f"option {option}",
+            chosen,
+            f"one of {', '.join(features)}",
+        )
         return chosen or next((name for name in names if name != key and name in features), None)
 
     rigs = []
@@ -143,8 +148,9 @@ class StepFeature:
 
 def _flatten(node: Any, name: str, features: dict[str, StepFeature], file: Path, depth: int) -> None:
     """Add the features below ``node`` of the feature tree to ``features``, names joined by ``/``."""
-    if not isinstance(node, dict) or depth > 32:
-        raise files.FormatError(file, name or _STEPS_FEATURE, type(node).__name__, "a feature")
+    files.refuse_if(
+        not isinstance(node, dict) or depth > 32, file, name or _STEPS_FEATURE, type(node).__name__, "a feature"
+    )
     if isinstance(inner := node.get("featuresDict"), dict):
         for key, value in files.get_entry(inner, "features", dict, file).items():
             _flatten(value, f"{name}/{key}" if name else key, features, file, depth + 1)
@@ -219,8 +225,9 @@ def _locate_episodes(root: Path, split: str | None, numbers: int | Sequence[int]
     for file in sorted(root.iterdir(), key=files.natural_sort_key):
         if match := _SHARD_PATTERN.match(file.name):
             shards.setdefault(match["split"], []).append(file)
-    if split is not None and split not in shards:
-        raise files.FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
+    files.refuse_if(
+        split is not None and split not in shards, root, "option split", split, f"one of {', '.join(sorted(shards))}"
+    )
     selected = None if numbers is None else {numbers} if isinstance(numbers, int) else {int(each) for each in numbers}
     locations: list[RecordLocation] = []
     n_before = 0

@@ -83,8 +83,13 @@ def read(
         not cameras, root, episodes[0], "no camera with depth", "obs/<camera>_depth or sensor_data/<camera>/depth"
     )
     chosen = cameras if camera is None else [camera] if isinstance(camera, str) else list(camera)
-    if unknown := [name for name in chosen if name not in cameras]:
-        raise files.FormatError(root, "option camera", ", ".join(unknown), f"among {', '.join(cameras)}")
+    files.refuse_if(
+        unknown := [name for name in chosen if name not in cameras],
+        root,
+        "option camera",
+        ", ".join(unknown),
+        f"among {', '.join(cameras)}",
+    )
     planes = None if clip_planes is None else files.to_array(clip_planes, (2,), root, "option clip_planes")
     if planes is not None and not 0 < planes[0] < planes[1]:
         raise files.FormatError(root, "option clip_planes", planes.tolist(), "0 < near < far")

@@ -124,7 +124,10 @@ def read(
     report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference, is_numbered)
     hw = files.read_image_header(colour[pairs[0][0]][1]).hw
     lens, remarks, data_set, is_y_up = _find_camera(root, intrinsics, camera, hw, K, fov)
-    unit = _find_unit(root, units_per_metre, data_set)
+    side_car = root / "meta.json"
+    stated = None if data_set is None else f"{data_set} stores 1/5000 m"
+    meta = files.read_json(side_car) if units_per_metre is None and side_car.is_file() else {}
+    units, source = image_folders.choose_units(root, units_per_metre, meta, side_car, _UNITS_PER_METRE, stated)
     candidates = (root / "groundtruth.txt", *sorted(root.glob(_ICL_TRAJECTORIES)))
     trajectory = next((file for file in candidates if file.is_file()), None)
     c2w = None
@@ -148,7 +151,7 @@ def read(
         hw=hw,
         depth_hw=image_folders.read_depth_type(rows[0].depth)[0],
         camera=lens,
-        units_per_metre=1 / unit.metres,
+        units_per_metre=units,
     )
     has_times = not is_numbered or data_set == "ICL-NUIM"
     if not has_times:
@@ -165,7 +168,7 @@ def read(
             poses=None if c2w is None else convert.to_poses(c2w, trajectory or root),
             rate_hz=_RATE_HZ if has_times else None,
             report=(*report, *remarks),
-            depth_unit=unit,
+            depth_unit=DepthUnit(1 / units, source),
             stored=stored,
         )
     ]
@@ -289,8 +292,13 @@ def _find_camera(
     fov: float | None,
 ) -> tuple[Camera, tuple[str, ...], str | None, bool]:
     """Camera of a sequence, report, data set whose unit of depth is documented, whether its trajectory has y up."""
-    if isinstance(intrinsics, str) and intrinsics not in ("camera", "ros"):
-        raise files.FormatError(root, "option intrinsics", intrinsics, "camera or ros")
+    files.refuse_if(
+        isinstance(intrinsics, str) and intrinsics not in ("camera", "ros"),
+        root,
+        "option intrinsics",
+        intrinsics,
+        "camera or ros",
+    )
     files.refuse_if(camera not in (None, "icl", *_CAMERA_CALIBRATIONS), root, "option camera", camera, "1, 2, 3 or icl")
     number = camera if isinstance(camera, int) else None if camera == "icl" else _find_camera_number(root)
     is_icl = camera == "icl" or (camera is None and number is None and _is_icl(root))
@@ -341,17 +349,6 @@ def _read_calibration(file: Path) -> tuple[list[float], np.ndarray | None]:
         return [values[0], values[4], values[2], values[5]], None
     files.refuse_if(len(values) not in (4, 8, 9), file, "numbers", " ".join(words), expected)
     return values[:4], np.array(values[4:]) if values[4:] else None
-
-
-def _find_unit(root: Path, option: float | None, data_set: str | None) -> DepthUnit:
-    side_car = root / "meta.json"
-    if option is not None:
-        units = files.to_positive(option, root, "option units_per_metre")
-        return DepthUnit(1 / units, "option units_per_metre")
-    if side_car.is_file() and "depth_scale" in (meta := files.read_json(side_car)):
-        return DepthUnit(1 / files.to_positive(meta["depth_scale"], side_car, "depth_scale"), "meta.json: depth_scale")
-    stated = None if data_set is None else f"{data_set} stores 1/5000 m"
-    return DepthUnit(1 / _UNITS_PER_METRE, stated)
 
 
 def _is_icl(root: Path) -> bool:
