@@ -17,7 +17,6 @@ from support.capture_cases import DELETE, Case, check_case, edit_files
 from support.writers import parts
 
 from dhtorch import data
-from dhtorch.data.io.decode import FormatError
 from dhtorch.data.units import DepthUnit
 from dhtorch.export import arrays
 from dhtorch.geometry import camera as cameras
@@ -63,28 +62,6 @@ def test_every_layout_gives_back_the_scene(tmp_path: Path, name: str, monkeypatc
         if writer.has_poses:
             torch.testing.assert_close(got.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-6, rtol=0)
             torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("name", "source"),
-    [
-        ("bop", "scene_camera.json: depth_scale"),
-        ("replica", "cam_params.json: scale"),
-        ("sens_folder", "_info.txt: m_depthShift"),
-        ("scannet", "ScanNet stores mm"),
-        ("icl_nuim", "ICL-NUIM stores 1/5000 m"),
-        ("named_frames", None),
-        ("ros_tum", None),
-        ("open3d", None),
-    ],
-)
-def test_what_states_the_unit_is_named(tmp_path: Path, name: str, source: str | None) -> None:
-    path = writers.CAPTURE_WRITERS[name](tmp_path, walk(2))
-    unit = data.open(path).depth_unit
-    assert unit is not None and unit.source == source
-    twice = data.open(path, depth_unit=2 * unit.metres)
-    assert twice.depth_unit == DepthUnit(2 * unit.metres, "option depth_unit")
-    torch.testing.assert_close(twice[0].depth, 2 * data.open(path)[0].depth)
 
 
 # ------------------------------------------------------------------------------------------------- variants and faults
@@ -159,6 +136,31 @@ def seven_numbers(lost: str) -> str:
     return "\n".join([lines[0], lost, lines[2]])
 
 
+def write_twice(root: Path, frames: list[Frame]) -> None:
+    """An Open3D folder with two trajectories."""
+    writers.write_open3d(root, frames, trajectory="odometry.log")
+    writers.write_open3d(root, frames)
+
+
+def far(text: str) -> str:
+    """A trajectory that ends somewhere else."""
+    lines = text.splitlines()
+    lines[-2] = lines[-2].rsplit(" ", 1)[0] + " 9.5"
+    return "\n".join(lines)
+
+
+def turned_walk(turned: bool) -> list[Frame]:
+    """Frames with depth of its own camera, which lies turned or not."""
+    frames = [frame.replace(depth_camera=CAMERA) for frame in walk(2)]
+    return [frame.replace(depth=frame.depth.mT) for frame in frames] if turned else frames
+
+
+def coarse() -> list[Frame]:
+    """A frame with depth of half the size."""
+    camera = cameras.resize(CAMERA, HW, (24, 32))
+    return [walk(1)[0].replace(depth=torch.full((1, 24, 32), 2.0), depth_camera=camera)]
+
+
 def blank(n: int) -> list[Frame]:
     """Frames of the size that published calibrations belong to."""
     image, depth = torch.zeros(1, 3, 480, 640, dtype=torch.uint8), torch.ones(1, 480, 640)
@@ -193,7 +195,8 @@ CASES = [
           "report": ("frame 1: no image: left out", "frame 2: no camera: left out", "no poses")},
          written={"poses": False, "depth_scale": 1.0}),
     Case("bop, each frame by its own entry", bop, 2, [("scene_camera.json", MIXED_BOP)],
-         {"f": F, "last f": [70.0, 58.25], "report": [r"depth_scale differs from frame to frame"]}),
+         {"f": F, "last f": [70.0, 58.25], "report": [r"depth_scale differs from frame to frame"], "medians": pytest.approx(
+             [k * float(frame.depth.median()) for k, frame in zip((1, 2), walk(2), strict=True)], abs=2e-4)}),
     Case("bop sensors are recordings", bop, 2,
          [("rgb", Path("rgb_realsense")), ("depth", Path("depth_realsense")),
           ("scene_camera.json", Path("scene_camera_realsense.json"))],
@@ -212,7 +215,8 @@ CASES = [
     Case("bop beside K of another layout", bop, 2, [("K.txt", "1 0 0\n0 1 0\n0 0 1\n")],
          {"format": "bop", "f": F, "report": ("not read: K.txt (cameras, poses or units in them are not used)",)}),
     # Replica
-    Case("replica, parameters above", replica, 2, [("cam_params.json", Path("../cam_params.json"))], {"f": F}),
+    Case("replica, parameters above", replica, 2, [("cam_params.json", Path("../cam_params.json"))],
+         {"f": F, "unit": (pytest.approx(1 / 6553.5), "cam_params.json: scale")}),
     Case("replica without parameters", replica, 2, [("cam_params.json", DELETE)],
          error=r"K: found no intrinsics, expected data.fov=69 .* or cam_params.json"),
     Case("replica without parameters, with K", replica, 2, [("cam_params.json", DELETE)],
@@ -248,7 +252,7 @@ CASES = [
          [*((f"{folder}/{i}.{end}", Path(f"{i:05d}.{end}")) for i in range(2)
             for folder, end in (("color", "jpg"), ("depth", "png"), ("pose", "txt"))),
           ("intrinsic/intrinsic_color.txt", Path("intrinsic.txt"))],
-         {"format": "scannet", "f": F, "same": ([0, 1], 1e-3)}),
+         {"format": "scannet", "f": F, "same": ([0, 1], 1e-3), "unit": (1 / 1000, "ScanNet stores mm")}),
     Case("extrinsics are named", scannet, 1, [("intrinsic/extrinsic_color.txt", parts.format_rows(SHIFTED))],
          {"report": ["^extrinsic_color.txt is not the identity; not applied"]}),
     Case("extrinsics of three rows", scannet, 1, [("intrinsic/extrinsic_color.txt", parts.format_rows(SHIFTED[:3]))],
@@ -272,6 +276,15 @@ CASES = [
       for trajectory, intrinsics in (
           ("trajectory.log", "camera_primesense.json"), ("odometry.log", "camera_intrinsic.json"),
           ("scene/trajectory.log", "intrinsic.json"), ("livingroom-traj.txt", "camera_primesense.json"))),
+    *(Case(f"of two trajectories {name}", write_twice, 3, edits, {"report": [words]})
+      for name, edits, words in (
+          ("the optimised one", [], r"poses are those of trajectory.log; odometry.log \(data.trajectory=odometry.log\) "
+           r"differs by at most (0|[\d.]+e-1\d) m"),
+          ("the optimised one, unlike the other", [("odometry.log", far)], r"trajectory.log; .* differs by at most [5-9]"),
+          ("that of more frames", [("trajectory.log", lambda text: "\n".join(text.splitlines()[:5]))],
+           "poses are those of odometry.log; trajectory.log .* has 1 poses for 3"))),
+    Case("a trajectory by option", write_twice, 3, [("odometry.log", far)], {"end": 9.5},
+         options={"trajectory": "odometry.log"}),
     Case("motions are no poses", open3d, 3, [("odometry.log", [("0 0 1\n", "0 1 3\n"), ("1 1 2\n", "1 2 3\n")])],
          {"posed": False, "report": ["^odometry.log: motions between two frames, not poses of frames: not used", "no poses"]},
          written={"trajectory": "odometry.log"}),
@@ -321,7 +334,7 @@ CASES = [
          written={"trajectory": "groundtruth.txt", "calibration": False}),
     Case("associations in the other order", icl, 3,
          [("associations.txt", "\n".join(f"{i} rgb/{i}.png {i} depth/{i}.png" for i in range(3)))],
-         {"same": ([0, 1, 2], 1 / 5000)}),
+         {"same": ([0, 1, 2], 1 / 5000), "unit": (1 / 5000, "ICL-NUIM stores 1/5000 m")}),
     Case("calibration of four numbers", ros, 2, [("calibration.txt", "61.5 58.25 33.5 21.75\n")],
          {"f": F, "c": C, "lens": None}),
     Case("calibration with a lens", ros, 2,
@@ -337,6 +350,11 @@ CASES = [
     Case("tum by its folder's name", lambda root, frames: ros(root / "rgbd_dataset_freiburg3_desk", frames), 2, (),
          {"unit": (1 / 5000, "TUM RGB-D stores 1/5000 m")}, path="rgbd_dataset_freiburg3_desk"),
     # numbered frames
+    Case("depth turned against its own camera", named, lambda: turned_walk(True),
+         error=r"depth\.png: size: found \d+x\d+, turned against its intrinsics"),
+    Case("depth of its own camera", named, lambda: turned_walk(False), (), {"depth hw": (48, 64)}),
+    # registered to the image at the density of the depth map, without gaps
+    Case("coarse depth with a camera of its own", named, coarse, (), {"depth hw": (24, 32), "median": 2.0, "returns": 768}),
     *(Case(f"depth_scale {scale}", counted, 1, [("meta.json", f'{{"depth_scale": {scale}}}')],
            {"unit": (pytest.approx(factor / 1000), "meta.json: depth_scale"), "same": ([0], 2e-3, factor)})
       for scale, factor in ((1000, 1), (0.001, 1), (0.0005, 0.5), (2000.0, 0.5))),
@@ -385,92 +403,31 @@ def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
     check_case(case, tmp_path)
 
 
-def test_of_two_trajectories_the_optimised_one_or_that_of_more_frames_is_read(tmp_path: Path) -> None:
-    frames = walk(3)
-    writers.write_open3d(tmp_path, frames, trajectory="odometry.log")
-    writers.write_open3d(tmp_path, frames)
-    text = (tmp_path / "odometry.log").read_text()
-    recording = data.open(tmp_path)
-    (line,) = recording.report
-    assert "poses are those of trajectory.log; odometry.log (data.trajectory=odometry.log) differs by at most" in line
-    assert float(line.split("at most ")[1].split(" m")[0]) < 1e-12
-    last = text.splitlines()
-    last[-4] = last[-4].rsplit(" ", 1)[0] + " 9.5"
-    (tmp_path / "odometry.log").write_text("\n".join(last))
-    assert float(data.open(tmp_path).report[0].split("at most ")[1].split(" m")[0]) > 5
-    assert data.open(tmp_path, trajectory="odometry.log").poses.t[2].tolist() != recording.poses.t[2].tolist()
-    (tmp_path / "trajectory.log").write_text("\n".join(text.splitlines()[:5]))
-    assert "poses are those of odometry.log; trajectory.log" in data.open(tmp_path).report[0]
-
-
-def test_bop_depth_of_each_frame_by_its_own_scale(tmp_path: Path) -> None:
-    frames = walk(2)
-    writers.write_bop(tmp_path, frames, depth_scale=0.1)
-    edit_files(tmp_path, [("scene_camera.json", MIXED_BOP)])
-    first, second = data.open(tmp_path)
-    torch.testing.assert_close(first.depth, frames[0].depth, atol=1e-4, rtol=0)
-    torch.testing.assert_close(second.depth, 2 * frames[1].depth, atol=2e-4, rtol=0)
-
-
 # ------------------------------------------------------------------------------------------------------------ real files
 
-
-@pytest.fixture
-def field_cases() -> Path:
-    """Folder of captures in other tools' layouts."""
-    folder = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "field_cases"
-    if not folder.is_dir():
-        pytest.skip("DHTORCH_DATA has no field_cases")
-    return folder
+FIELD = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "field_cases"
 
 
+@pytest.mark.skipif(not FIELD.is_dir(), reason="DHTORCH_DATA has no field_cases")
 @pytest.mark.parametrize(
-    ("case", "format", "n", "f", "source"),
+    ("case", "format", "n", "f", "unit", "median"),
     [
-        ("02-redwood", "open3d", 5, 525, None),
-        ("05-bop-depth-scale", "bop", 5, 525, "scene_camera.json: depth_scale"),
-        ("06-scannet-export", "scannet", 4, 1063.125, "ScanNet stores mm"),
-        ("07-replica-niceslam", "replica", 5, 525, "cam_params.json: scale"),
-        ("21-3rscan", "sens_folder", 3, 787.5, "_info.txt: m_depthShift"),
+        ("02-redwood", "open3d", 5, 525, DepthUnit(1e-3), 1.861),
+        ("05-bop-depth-scale", "bop", 5, 525, "scene_camera.json: depth_scale", 1.861),
+        ("06-scannet-export", "scannet", 4, 1063.125, "ScanNet stores mm", 1.861),
+        ("07-replica-niceslam", "replica", 5, 525, "cam_params.json: scale", 1.861),
+        ("21-3rscan", "sens_folder", 3, 787.5, "_info.txt: m_depthShift", 1.861),
+        ("19-icl-nuim", "tum", 3, 481.2, DepthUnit(1 / 5000, "ICL-NUIM stores 1/5000 m"), None),
+        ("20-ros-tum-mm", "tum", None, 525, DepthUnit(1 / 5000), 1.861 / 5),
     ],
 )
-def test_field_cases(field_cases: Path, case: str, format: str, n: int, f: float, source: str | None) -> None:
-    recording = data.open(field_cases / case)
-    assert recording.format == format and len(recording) == n
-    assert recording.poses is not None and recording.poses.t.shape[0] == n
-    assert recording.depth_unit is not None and recording.depth_unit.source == source
+def test_field_cases(
+    case: str, format: str, n: int | None, f: float, unit: DepthUnit | str, median: float | None
+) -> None:
+    recording = data.open(FIELD / case)
+    assert recording.format == format and n in (None, len(recording)) and recording.depth_unit is not None
+    assert unit in (recording.depth_unit, recording.depth_unit.source)
+    assert recording.poses is not None or format == "tum"
     assert float(recording[0].camera.f[0, 0]) == pytest.approx(f)
     depth = torch.cat([frame.depth[frame.depth > 0] for frame in recording])
-    assert float(depth.median()) == pytest.approx(1.861, rel=0.005)
-
-
-def test_field_case_icl_nuim(field_cases: Path) -> None:
-    recording = data.open(field_cases / "19-icl-nuim")
-    assert len(recording) == 3 and recording[0].camera.f.tolist() == [[pytest.approx(481.2), 480]]
-    assert recording.depth_unit == DepthUnit(1 / 5000, "ICL-NUIM stores 1/5000 m")
-
-
-def test_field_case_ros_recorder(field_cases: Path) -> None:
-    recording = data.open(field_cases / "20-ros-tum-mm")
-    assert recording[0].camera.f.tolist() == [[525, 525]] and recording.depth_unit == DepthUnit(1 / 5000)
-    depth = data.open(field_cases / "20-ros-tum-mm", depth_unit="mm")[0].depth
-    assert float(depth[depth > 0].median()) == pytest.approx(1.861, rel=0.01)
-
-
-def test_depth_that_lies_turned_against_its_own_camera_is_refused(tmp_path: Path) -> None:
-    frames = [frame.replace(depth_camera=cameras.resize(CAMERA, frame.hw, frame.depth.shape[-2:])) for frame in walk(2)]
-    writers.write_named_frames(tmp_path / "upright", frames)
-    assert data.open(tmp_path / "upright")[0].depth.shape == frames[0].depth.shape
-    writers.write_named_frames(tmp_path / "turned", [frame.replace(depth=frame.depth.mT) for frame in frames])
-    with pytest.raises(FormatError, match=r"depth\.png: size: found \d+x\d+, turned against its intrinsics"):
-        data.open(tmp_path / "turned")
-
-
-def test_coarse_depth_with_a_camera_of_its_own_has_no_gaps(tmp_path: Path) -> None:
-    """It is registered to the picture at its own density, not at that of the picture."""
-    (frame,) = walk(1)
-    coarse = torch.full((1, frame.hw[0] // 2, frame.hw[1] // 2), 2.0)
-    camera = cameras.resize(CAMERA, frame.hw, tuple(coarse.shape[-2:]))
-    writers.write_named_frames(tmp_path, [frame.replace(depth=coarse, depth_camera=camera)])
-    depth = data.open(tmp_path)[0].depth
-    assert depth.shape == coarse.shape and (depth[0, 1:-1, 1:-1] == 2).all()
+    assert median is None or float(depth.median()) == pytest.approx(median, rel=0.01)

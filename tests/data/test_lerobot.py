@@ -152,20 +152,6 @@ def test_writer_codes_by_the_published_rule() -> None:
     np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
 
 
-@pytest.mark.parametrize("depth", ["video", "png"])
-def test_depth_without_a_flag_is_recognised_by_its_pixels(depth: str, tmp_path: Path) -> None:
-    write_lerobot(tmp_path, two_episodes(), depth=depth)
-    flagged = data.open(tmp_path, episode=0)
-    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].pop("is_depth_map"))
-    unflagged = data.open(tmp_path, episode=0)
-    assert torch.equal(unflagged[1].depth, flagged[1].depth) and unflagged[1].depth.any()
-    kind = {"video": "gray12le", "png": "uint16"}[depth]
-    remark = f"{KEY}_depth looks like depth: one channel, {kind}, without is_depth_map; data.depth={KEY}_depth sets it"
-    assert unflagged.report == (remark,) and flagged.report == ()
-    assert data.open(tmp_path, episode=0, depth=f"{KEY}_depth").report == ()
-    assert unflagged.depth_unit == flagged.depth_unit == (None if depth == "video" else DepthUnit(1e-3))
-
-
 def test_a_grey_camera_of_8_bits_is_no_depth(tmp_path: Path) -> None:
     """One channel alone does not make depth: infrared cameras have it, too."""
     write_lerobot(tmp_path, two_episodes(), depth="video", depth_pixels="yuv420p12le")
@@ -308,6 +294,12 @@ def column(name: str, values: list[float]) -> Any:
     return lambda table: table.set_column(table.schema.get_field_index(name), name, cells)
 
 
+def late(table: pyarrow.Table) -> pyarrow.Table:
+    """A table without numbers of rows whose times begin one frame later."""
+    stamps = table.column("timestamp").to_numpy() + 1 / 30
+    return column("timestamp", stamps)(table).drop_columns(["frame_index"])
+
+
 def odd_tracks(info: dict[str, Any]) -> tuple[str, Any]:
     return feature(DEPTH, info=info)
 
@@ -336,6 +328,18 @@ CASES = [
       for image, depth, intrinsics in (("video", "video", "feature"), ("image", "tiff", "side-car"),
                                        ("video", "png", "feature"), ("image", "array", "feature"))
       for version in (2, 3) for episode, n, frames in ((0, 2, FIRST), (1, 4, SECOND))),
+    *(set_case(f"depth without a flag, {depth}", [odd_tracks({"is_depth_map": DELETE})],
+               {"report": report, "unit": unit, "same": ([0, 1], STEP[depth], 1.0, True)}, written={"depth": depth},
+               options=options)
+      for depth, kind, unit in (("video", "gray12le", None), ("png", "uint16", (1e-3, None)))
+      for options, report in (
+          ({}, (f"{DEPTH} looks like depth: one channel, {kind}, without is_depth_map; data.depth={DEPTH} sets it",)),
+          ({"depth": DEPTH}, ()))),
+    # times that begin one frame after the video: by time every row would get the next image
+    set_case("rows without numbers whose clock is late", [(TABLE, late)],
+             {"number": [0, 1, 2, 3], "times of": [0.0, 0.033333, 0.066667, 0.1], "same": ([0, 1, 2, 3], 1e-5),
+              "report": ["times begin at 0.03333 s: images taken by the order of rows"]}, frames=SECOND,
+             written=V2 | {"depth": "tiff"}),
     set_case("a camera that is only declared", [declare("ghost")], {"name": "episode_000000/front"}, written=V2),
     set_case("a camera that is only declared, by name", [declare("ghost")], written=V2,
              options={"camera": "observation.images.ghost"}, error="ghost"),
@@ -447,22 +451,6 @@ def test_columns_that_cannot_be_arrays(tmp_path: Path) -> None:
     assert codec_parquet.read_cell(file, "deep", 1).tolist() == [[3, 4]]
     with pytest.raises(FormatError, match=r"rows: found 2, expected row 2"):
         codec_parquet.read_cell(file, "deep", 2)
-
-
-def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: Path) -> None:
-    """Times that begin one frame after the video: by time every row would get the next picture."""
-    shots = two_episodes()[1]
-    write_lerobot(tmp_path, [shots], version=2, depth="tiff")
-    (file,) = (tmp_path / "data").rglob("*.parquet")
-    table = parquet.read_table(file)
-    late = pyarrow.array(np.asarray(table.column("timestamp").to_numpy() + 1 / 30, np.float32))
-    table = table.set_column(table.column_names.index("timestamp"), "timestamp", late).drop_columns(["frame_index"])
-    parquet.write_table(table, file)
-    recording = data.open(tmp_path)
-    assert len(recording) == 4 and "times begin at 0.03333 s: images taken by the order of rows" in recording.report[0]
-    for i, shot in enumerate(shots):
-        assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5
-    assert recording.times is not None and float(recording.times[0]) == 0
 
 
 def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

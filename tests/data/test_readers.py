@@ -97,26 +97,6 @@ def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
         assert disagreement(recording[0], right)[0] < 0.005
 
 
-def test_a_pair_of_middlebury_2005_states_what_it_assumes(tmp_path: Path) -> None:
-    codes = np.full((370, 463), 90, np.uint8)
-    codes[:, :50] = 0
-    for name, image in {"view1": codes, "view5": codes, "disp1": codes, "disp5": codes + 1}.items():
-        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
-    (tmp_path / "dmin.txt").write_text("270\n")
-    recording = data.open(tmp_path)
-    left, right = recording
-    # A third of the size: f = 3740 / 3 px, disparity 90 / 3 px, and a shift of 270 / 3 px between the two principal points.
-    assert left.camera.f[0, 0] == pytest.approx(3740 / 3) and float(right.camera.c[0, 0] - left.camera.c[0, 0]) == 90
-    assert left.camera.c.tolist() == [[231.0, 184.5]]
-    assert not left.depth[0, :, :50].any() and (left.depth[0, :, 50:] > 0).all()
-    assert float(left.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (90 / 3 + 270 / 3))
-    assert float(right.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (91 / 3 + 270 / 3))
-    assert recording.poses.t[1].tolist() == [0.16, 0, 0] and "principal point assumed" in recording.report[0]
-    (tmp_path / "dmin.txt").write_text("far\n")
-    with pytest.raises(FormatError, match=r"dmin\.txt: shift"):
-        data.open(tmp_path)
-
-
 # ------------------------------------------------------------------------------------------------------- recordings
 
 
@@ -205,6 +185,15 @@ def test_a_point_is_hidden_by_a_much_nearer_one_in_the_square_around_it(reach: i
 def still_driving(root: Path, frames: list[Frame]) -> None:
     lidar = Pose(torch.cat([pose(i).R for i in range(3)]), torch.cat([pose(i).t for i in range(3)]))
     writers.write_driving(root, {"FRONT": frames}, lidar)
+
+
+def write_views(root: Path, _frames: list[Frame]) -> None:
+    """A pair of Middlebury 2005 with constant disparities."""
+    codes = np.full((370, 463), 90, np.uint8)
+    codes[:, :50] = 0
+    for name, image in {"view1": codes, "view5": codes, "disp1": codes, "disp5": codes + 1}.items():
+        cv2.imwrite(str(root / f"{name}.png"), image)
+    (root / "dmin.txt").write_text("270\n")
 
 
 def write_car(root: Path, frames: list[Frame], *, both: bool = False) -> None:
@@ -339,6 +328,12 @@ CASES = [
           (npz(np.array([{"a": 1}], dtype=object)), r"scene_disp.npz: arr_0 dtype: found object, expected real numbers"),
           (npz(other=np.zeros(HW)), r"scene_disp.npz: key: found other.npy, expected arr_0.npy"),
           (npz(np.zeros((3, 3))), r"scene_disp.npz: arr_0: found shape \(3, 3\), expected \(48, 64\), as the image")))),
+    # A third of the size: f = 3740 / 3 px, disparity 90 / 3 px, and a shift of 270 / 3 px between the principal points.
+    Case("middlebury 2005", write_views, 1, (), {
+        "f": pytest.approx([3740 / 3] * 2), "c": [231.0, 184.5], "last c": pytest.approx([321.0, 184.5]),
+        "returns": 370 * 413, "report": ["principal point assumed"], "second": [0.16, 0, 0],
+        "medians": pytest.approx([0.16 * 3740 / (k + 270) for k in (90, 91)])}),
+    Case("middlebury 2005 without a shift", write_views, 1, [("dmin.txt", "far\n")], error=r"dmin\.txt: shift"),
     Case("an npz pair without meta.json", write_npz, stereo_pair, [("meta.json", DELETE)],
          error=r"meta.json: file: found no such file"),
     # driving

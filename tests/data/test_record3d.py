@@ -305,9 +305,9 @@ class Phone:
         self.over = threading.Event()
         self.on_new_frame: Callable[[], None] = lambda: None
         self.on_stream_stopped: Callable[[], None] = lambda: None
-
-    def get_connected_devices(self) -> list[Any]:
-        return [SimpleNamespace(product_id=1, udid="x")]
+        self.get_connected_devices: Callable[[], list[Any]] = lambda: [SimpleNamespace(product_id=1, udid="x")]
+        self.get_rgb_frame, self.get_depth_frame = lambda: self.rgb, lambda: self.depth
+        self.get_confidence_frame, self.get_device_type = lambda: self.conf, lambda: int(lidar)
 
     def connect(self, device: Any) -> bool:
         self.connected = device.udid == "x"
@@ -334,15 +334,6 @@ class Phone:
         self.on_stream_stopped()
         self.over.set()
 
-    def get_rgb_frame(self) -> np.ndarray:
-        return self.rgb
-
-    def get_depth_frame(self) -> np.ndarray:
-        return self.depth
-
-    def get_confidence_frame(self) -> np.ndarray:
-        return self.conf
-
     def get_intrinsic_mat(self) -> Any:
         (fx, fy), (tx, ty) = self.now.camera.f[0].tolist(), self.now.camera.c[0].tolist()
         return SimpleNamespace(fx=fx, fy=fy, tx=tx, ty=ty)
@@ -353,9 +344,6 @@ class Phone:
         c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's axes
         row = [*Rotation.from_matrix(c2w[:3, :3]).as_quat(), *c2w[:3, 3]]
         return SimpleNamespace(**dict(zip(("qx", "qy", "qz", "qw", "tx", "ty", "tz"), row, strict=True)))
-
-    def get_device_type(self) -> int:
-        return int(self.lidar)
 
 
 def test_live_frames_are_copies_with_our_axes() -> None:
@@ -398,7 +386,7 @@ def test_live_failures_reach_the_reader() -> None:
     with pytest.raises(FormatError, match=r"frames: found none within 0.05 s"), LiveFrames(phone, timeout=0.05) as live:
         next(iter(live))
     assert not phone.connected  # the block leaves the phone alone whatever happens
-    phone.get_connected_devices = lambda: []  # type: ignore[method-assign]
+    phone.get_connected_devices = lambda: []
     with pytest.raises(FormatError, match="devices: found none"), LiveFrames(phone):
         pass
     phone.connect = lambda device: False  # type: ignore[method-assign]
