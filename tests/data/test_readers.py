@@ -373,40 +373,39 @@ def test_variants_are_read_and_faults_named(case: Case, tmp_path: Path) -> None:
     check_case(case, tmp_path)
 
 
-def fails(message: str, *args: object, **options: object) -> None:
-    """Opening, and reading every frame, ends in one line that contains ``message`` (a regular expression)."""
-    with pytest.raises(ValueError, match=message) as caught:
-        for recording in data.open_all(*args, **options):
-            list(recording)
+@pytest.mark.parametrize(
+    ("path", "format", "message"),
+    [
+        ("nowhere", "auto", r"nowhere: path: found no such file or folder, expected a capture"),
+        ("nowhere", "tum", r"nowhere: path: found no such file or folder, expected a tum capture"),
+        ("empty", "auto", r"format: found an empty folder, expected from a phone: Record3D's \.r3d"),
+        ("empty", "frames_dir", r"frames: found none, expected frame-XXXXXX"),
+        (
+            "scan.xyz",
+            "auto",
+            r"scan.xyz: format: found a finished 3D model without its frames, expected the frames, from a phone",
+        ),
+        *(("scan.xyz", format, r"scan.xyz") for format in data.FORMATS),  # a file, also where the reader is named
+        ("scene", "kitti", rf"format: found kitti, expected auto, {', '.join(data.FORMATS)}"),
+        ("scene", "driving", r"scene_\*.json: found 0 such files, expected exactly one"),
+        ("scene", "tum", r"rgb frames: found none"),
+        ("scene", "rectified", r"calib.txt|left.png: found 0 such files"),
+    ],
+)
+def test_nothing_there_or_unknown(tmp_path: Path, path: str, format: str, message: str) -> None:
+    writers.write_named_frames(tmp_path / "scene", walk(1))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "scan.xyz").write_text("1 2 3")
+    with pytest.raises(FormatError, match=message) as caught:
+        _ = data.open_all(tmp_path / path, format)[0]
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_there_or_unknown(tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    writers.write_named_frames(scene, walk(3))
-    fails(r"nowhere: path: found no such file or folder, expected a capture", tmp_path / "nowhere")
-    fails(r"nowhere: path: found no such file or folder, expected a tum capture", tmp_path / "nowhere", "tum")
-    (tmp_path / "empty").mkdir()
-    every = ", ".join(data.FORMATS)
-    fails(r"format: found an empty folder, expected from a phone: Record3D's \.r3d", tmp_path / "empty")
-    (tmp_path / "scan.xyz").write_text("1 2 3")
-    fails(
-        r"scan.xyz: format: found a finished 3D model without its frames, expected the frames, from a phone",
-        tmp_path / "scan.xyz",
-    )
-    for format in data.FORMATS:  # also where the reader is named and the path is a file
-        fails(r"scan.xyz", tmp_path / "scan.xyz", format)
-    fails(rf"format: found kitti, expected auto, {every}", scene, "kitti")
-    fails(
-        r"data: format frames_dir has no option 'unit', expected one of intrinsics, K, fov, K_depth, distortion",
-        scene,
-        unit=3,
-    )
-    fails(r"scene_\*.json: found 0 such files, expected exactly one", scene, "driving")
-    fails(r"rgb frames: found none", scene, "tum")
-    fails(r"calib.txt|left.png: found 0 such files", scene, "rectified")
-    fails(r"frames: found none, expected frame-XXXXXX", tmp_path / "empty", "frames_dir")
-    assert data.recognise(scene) == ("frames_dir", "frame-XXXXXX.{color,depth,pose} files")
+def test_an_unknown_option_is_named_beside_the_known_ones(tmp_path: Path) -> None:
+    writers.write_named_frames(tmp_path, walk(1))
+    assert data.recognise(tmp_path) == ("frames_dir", "frame-XXXXXX.{color,depth,pose} files")
+    with pytest.raises(ValueError, match="format frames_dir has no option 'unit', expected one of intrinsics, K, fov"):
+        data.open(tmp_path, unit=3)
 
 
 def test_scenes_need_their_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,40 +116,42 @@ def test_pictures_are_paired_by_their_stamps(
         assert ("it plays" in recording.report[0]) == (stamps != [i / 60 for i in KEPT])
 
 
-def test_display_matrix_with_lying_depth_changes_nothing(tmp_path: Path, room: list[Frame]) -> None:
-    writers.write_stray(tmp_path / "plain", room)
-    for k in (1, 2, 3):
-        writers.write_stray(tmp_path / str(k), room, display=k)
-        recording = data.open(tmp_path / str(k))
-        assert recording.report == ()
-        for got, want in zip(recording, data.open(tmp_path / "plain"), strict=True):
-            assert torch.equal(got.image, want.image) and torch.equal(got.depth, want.depth)
-
-
-def test_a_display_matrix_applies_where_depth_lies_as_the_film_is_displayed(tmp_path: Path, room: list[Frame]) -> None:
-    writers.write_stray(tmp_path, room, film_turn=3, display=1)
+@pytest.mark.parametrize(
+    ("written", "report"),
+    [
+        *(({"display": k}, ()) for k in (0, 1, 2, 3)),  # a display matrix with lying depth changes nothing
+        (
+            {"film_turn": 3, "display": 1},
+            ("orientation: display matrix of rgb.mp4: pictures are turned by 90 degrees, as depth lies",),
+        ),
+        *(
+            (
+                {"film_turn": k},
+                (
+                    "orientation: depth 128x96 (landscape) beside pictures 96x128 (portrait): "
+                    f"pictures are turned by {degrees} degrees, as their edges coincide",
+                ),
+            )
+            for k, degrees in ((1, 270), (3, 90))
+        ),
+    ],
+)
+def test_a_film_is_read_as_depth_lies(
+    tmp_path: Path, room: list[Frame], written: dict[str, Any], report: tuple[str, ...]
+) -> None:
+    writers.write_stray(tmp_path, room, **written)
     recording = data.open(tmp_path)
-    assert recording.report == (
-        "orientation: display matrix of rgb.mp4: pictures are turned by 90 degrees, as depth lies",
-    )
-    assert max(picture_error(got, want) for got, want in zip(recording, room, strict=True)) < 6
-    writers.write_stray(tmp_path / "wrong", room, film_turn=1, display=1)
-    with pytest.raises(FormatError, match=r"orientation: found display matrix of rgb.mp4, but edges"):
-        data.open(tmp_path / "wrong")
-
-
-@pytest.mark.parametrize("k", [1, 3])
-def test_a_film_turned_upright_is_turned_back(tmp_path: Path, room: list[Frame], k: int) -> None:
-    writers.write_stray(tmp_path, room, film_turn=k)
-    recording = data.open(tmp_path)
-    assert recording.report == (
-        "orientation: depth 128x96 (landscape) beside pictures 96x128 (portrait): "
-        f"pictures are turned by {270 if k == 1 else 90} degrees, as their edges coincide",
-    )
+    assert recording.report == report
     for got, want in zip(recording, room, strict=True):
-        assert got.image.shape == want.image.shape
-        assert picture_error(got, want) < 6
+        assert got.image.shape == want.image.shape and picture_error(got, want) < 6
         torch.testing.assert_close(got.camera.c, want.camera.c)
+        torch.testing.assert_close(got.depth, want.depth, atol=STEP / 2 + 1e-6, rtol=0)
+
+
+def test_a_display_matrix_against_the_edges_is_refused(tmp_path: Path, room: list[Frame]) -> None:
+    writers.write_stray(tmp_path, room, film_turn=1, display=1)
+    with pytest.raises(FormatError, match=r"orientation: found display matrix of rgb.mp4, but edges"):
+        data.open(tmp_path)
 
 
 def npy(array: np.ndarray) -> bytes:
