@@ -31,7 +31,7 @@ from dhtorch.cli import run
 from dhtorch.data.codecs import parquet as codec_parquet
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers import lerobot_depth, lerobot_rows
+from dhtorch.data.readers import lerobot_rows
 from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.data.units import DepthUnit
 from dhtorch.export.arrays import encode_depth_codes
@@ -123,23 +123,23 @@ def test_codes_to_metres(log: bool) -> None:
     feature = LeRobotFeature(
         "d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log}
     )
-    metres = lerobot_depth.dequantise_depth(feature, np.arange(4096, dtype=np.uint16), Path("x"))
+    metres = lerobot_rows.dequantise_depth(feature, np.arange(4096, dtype=np.uint16), Path("x"))
     assert not metres[[0, 1, 4094, 4095]].any() and (np.diff(metres[2:-2]) > 0).all()
     steps = np.diff(metres[2:-2])
     assert steps[-1] / steps[0] == pytest.approx((4 + 3.5) / (0.2 + 3.5) if log else 1, rel=0.01)
     assert metres[1000] == pytest.approx(3.7 * (7.5 / 3.7) ** (1000 / 4095) - 3.5 if log else 0.2 + 3.8 * 1000 / 4095)
     with pytest.raises(FormatError, match="12-bit codes"):
-        lerobot_depth.dequantise_depth(feature, np.array([4096], dtype=np.uint16), Path("x"))
+        lerobot_rows.dequantise_depth(feature, np.array([4096], dtype=np.uint16), Path("x"))
     for wrong in (5.0, -1.0, "0.2", None, [0.2], 10**400, float("nan"), float("inf")):
         bad = LeRobotFeature("d", "video", (1, 1), {"video.depth_min": wrong, "video.depth_max": 4.0})
         with pytest.raises(
             FormatError, match=r"x: d depth_min, depth_max, shift: found .*, expected a range of metres"
         ):
-            lerobot_depth.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
+            lerobot_rows.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
     bad = LeRobotFeature("d", "video", (1, 1), {"video.shift": -0.01, "video.use_log": log})
     if log:
         with pytest.raises(FormatError, match="a range of metres"):
-            lerobot_depth.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
+            lerobot_rows.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
 
 
 def test_writer_codes_by_the_published_rule() -> None:
@@ -148,7 +148,7 @@ def test_writer_codes_by_the_published_rule() -> None:
     blank = Frame(torch.zeros(1, 3, 1, 4), z, CAMERA)
     codes = quantise_lerobot_depth(blank)
     feature = LeRobotFeature("d", "video", (1, 4, 1), {})
-    metres = lerobot_depth.dequantise_depth(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
+    metres = lerobot_rows.dequantise_depth(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
     np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
 
 

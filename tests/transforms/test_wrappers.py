@@ -17,8 +17,8 @@ from support.stub_samples import FixedEstimate, H, N, W, added, sample, tiny
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dhtorch.codes import Source
-from dhtorch.data.readers.lerobot_depth import dequantise_depth
 from dhtorch.data.readers.lerobot_meta import LeRobotFeature
+from dhtorch.data.readers.lerobot_rows import dequantise_depth
 from dhtorch.transforms import (
     AddedCollate,
     ExtendDepth,

@@ -27,14 +27,6 @@ from dhtorch.data.clocks import nearest_stamps
 from dhtorch.data.codecs.parquet import read_cell
 from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.data.io import decode as files
-from dhtorch.data.readers.lerobot_depth import (
-    decode_depth_picture,
-    dequantise_depth,
-    find_depth_feature,
-    find_depth_unit,
-    find_origin_feature,
-    flag_unmarked_depth,
-)
 from dhtorch.data.readers.lerobot_meta import (
     LeRobotEpisode,
     LeRobotEpisodes,
@@ -45,8 +37,14 @@ from dhtorch.data.readers.lerobot_meta import (
     select_colour_keys,
 )
 from dhtorch.data.readers.lerobot_rows import (
+    decode_depth_picture,
+    dequantise_depth,
     find_capture_columns,
+    find_depth_feature,
+    find_depth_unit,
+    find_origin_feature,
     find_row_stamps,
+    flag_unmarked_depth,
     pair_episode_videos,
     read_capture_clock,
     read_encoded_image,
