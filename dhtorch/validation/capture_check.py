@@ -206,17 +206,18 @@ def _intrinsics_findings(frames: Sequence[Frame]) -> list[Finding]:
     if not frames or 0 in frames[0].hw:
         return []
     c, (h, w) = frames[0].camera.c[0].double() + 0.5, frames[0].hw
-    relative = c / torch.tensor([w, h], dtype=torch.float64)
+    size = torch.tensor([w, h], dtype=torch.float64)
+    relative = c / size
     if float((relative - 0.5).abs().max()) <= MAX_CENTRE_OFFSET:
         return []
-    exchanged = c.flip(-1) / torch.tensor([w, h], dtype=torch.float64)
     start = f"the principal point {c[0]:.0f}, {c[1]:.0f} px is far from the middle of pictures of {w}x{h}"
-    if float((exchanged - 0.5).abs().max()) <= MAX_CENTRE_OFFSET:
-        return [Finding("intrinsics", f"{start}: cx and cy (and fx and fy) look exchanged", "data.K=[fx,fy,cx,cy]")]
-    factor = 2 * float(relative.mean())
-    if float((relative / relative.mean() - 1).abs().max()) <= MAX_CENTRE_OFFSET:
-        text = f"{start}: the intrinsics look like those of pictures {factor:.3g} times as large"
-        return [Finding("intrinsics", text, "data.K=[fx,fy,cx,cy]")]
+    larger = f"the intrinsics look like those of pictures {2 * float(relative.mean()):.3g} times as large"
+    for offset, text in (
+        (c.flip(-1) / size - 0.5, "cx and cy (and fx and fy) look exchanged"),
+        (relative / relative.mean() - 1, larger),
+    ):
+        if float(offset.abs().max()) <= MAX_CENTRE_OFFSET:
+            return [Finding("intrinsics", f"{start}: {text}", "data.K=[fx,fy,cx,cy]")]
     return []
 
 
@@ -245,10 +246,10 @@ def _field_of_pictures(
     Poses and depth must agree, and no fault of another kind may explain the tracks.
     """
     is_other = fault is not None and fault.kind not in ("registration", "focal length", "along the ray")
-    if poses is None or poses.surfaces_contradict or is_other or not tracked:
+    if poses is None or recording.poses is None or poses.surfaces_contradict or is_other or not tracked:
         return None
     pairs, tracks = zip(*tracked, strict=True)
-    field = measure_picture_field(_poses_of(recording), views, pairs, tracks)
+    field = measure_picture_field(recording.poses, views, pairs, tracks)
     if field is None or not field.differs:
         return None
     by_poses = 1.0 if poses.tracks is None else poses.tracks.best_score
@@ -267,15 +268,15 @@ def _combined_findings(
     tracks: WindowTracks,
 ) -> list[Finding]:
     """Findings from the two checks: the fault of depth beside its pictures, and the poses beside the depth."""
-    mended = None
-    if poses is not None and fault is not None:
+    mended, stated_poses = None, recording.poses
+    if poses is not None and stated_poses is not None and fault is not None:
         undone = {
             i: frame.replace(depth=faults.undo_fault(window[i + fault.lag].depth, fault, frame))
             for i, frame in window.items()
             if i + fault.lag in window
         }
-        mended = check_poses(_poses_of(recording), undone, [(i, j) for i, j in pairs if i in undone and j in undone])
-    if poses is None or not poses.contradicts:
+        mended = check_poses(stated_poses, undone, [(i, j) for i, j in pairs if i in undone and j in undone])
+    if poses is None or stated_poses is None or not poses.contradicts:
         # Pictures instead of depth have the fault if undoing it in the depth makes surfaces disagree more.
         stated, other = (math.nan if each is None else each.surfaces.stated for each in (poses, mended))
         is_of_pictures = other > 1.5 * stated and other - stated > 0.003
@@ -293,50 +294,36 @@ def _combined_findings(
         return [_fault_finding(fault)]
     text, remedy = describe_contradiction(poses, recording.depth_unit)
     lag = poses.best.lag if poses.is_explained else 0
-    if lag and _pictures_follow(_poses_of(recording), lag, window, pairs, tracks):
+    by_lag = (
+        [_epipolar_distance(stated_poses, by, window, pairs, tracks) for by in (0, lag)] if lag else [math.inf, 0.0]
+    )
+    if by_lag[0] <= 0.7 * by_lag[1]:  # the tracks fit the stated poses clearly better: the depth is off
         return [Finding("time offset", _lag_text(-lag, "pictures and poses"), f"data.depth_lag={-lag}")]
     findings = [Finding("poses", f"{text}; they are not used", remedy)]
     return findings if fault is None or lag else [*findings, _fault_finding(fault)]
 
 
-def _poses_of(recording: Recording) -> Pose:
-    assert recording.poses is not None
-    return recording.poses
-
-
 def _fault_finding(fault: KnownFault, *, pictures: bool = False) -> Finding:
     """Sentence and option for a fault of the depth beside its pictures; ``pictures``: these contradict the poses."""
-    which = "pictures" if pictures else "depth"
-    seen = "; depth and poses agree" if pictures else ""
-    if fault.kind == "time offset":
-        text = _lag_text(-fault.lag, "depth and poses", "the pictures are") if pictures else _lag_text(fault.lag)
-        return Finding(fault.kind, text, "" if pictures else f"data.depth_lag={fault.lag}")
-    if fault.kind in ("mirrored", "rolled"):
-        verb = "are" if pictures else "is"
-        text = f"depth and pictures differ in orientation: {which} {verb} {fault.name}{seen}"
-        return Finding(fault.kind, text, "" if pictures else f"data.depth_turn={_TURN_OPTIONS[fault.name]}")
-    if fault.kind == "registration":
-        text = f"depth does not lie over its pictures ({fault.name}){seen}: one of them is cropped, or depth has a K"
-        return Finding(fault.kind, f"{text} of its own (data.K_depth=)")
-    return Finding(fault.kind, f"depth is wrong: {fault.name}")
+    which, seen = ("pictures are", "; depth and poses agree") if pictures else ("depth is", "")
+    turned = f"depth and pictures differ in orientation: {which} {fault.name}{seen}"
+    turn = f"data.depth_turn={_TURN_OPTIONS.get(fault.name)}"
+    apart = f"depth does not lie over its pictures ({fault.name}){seen}: one of them is cropped, or depth has a K"
+    late = _lag_text(-fault.lag, "depth and poses", "the pictures are") if pictures else _lag_text(fault.lag)
+    text, remedy = {
+        "time offset": (late, f"data.depth_lag={fault.lag}"),
+        "mirrored": (turned, turn),
+        "rolled": (turned, turn),
+        "registration": (f"{apart} of its own (data.K_depth=)", ""),
+    }.get(fault.kind, (f"depth is wrong: {fault.name}", ""))
+    return Finding(fault.kind, text, "" if pictures else remedy)
 
 
 def _lag_text(lag: int, against: str = "the pictures", subject: str = "depth is") -> str:
-    late = "late" if lag > 0 else "early"
-    return f"{subject} {format_count(abs(lag), 'frame')} {late} against {against}"
+    return f"{subject} {format_count(abs(lag), 'frame')} {'late' if lag > 0 else 'early'} against {against}"
 
 
 # ---------------------------------------------------------------------------------------------- pictures beside poses
-
-
-def _pictures_follow(
-    poses: Pose, lag: int, window: Mapping[int, Frame], pairs: Sequence[tuple[int, int]], tracks: WindowTracks
-) -> bool:
-    """Whether tracks fit the stated poses clearly better than the poses ``lag`` frames later: then the depth is off."""
-    if not tracks.pairs:
-        return False
-    stated, shifted = (_epipolar_distance(poses, by, window, pairs, tracks) for by in (0, lag))
-    return stated <= 0.7 * shifted
 
 
 def _epipolar_distance(
@@ -344,7 +331,7 @@ def _epipolar_distance(
 ) -> float:
     """Median angle of tracks from their epipolar planes under the poses ``by`` frames later, rad; NaN without any."""
     angles = []
-    for (i, j), samples, track in zip(pairs, tracks.samples, tracks.tracks, strict=True):
+    for (i, j), samples, track in zip(pairs, tracks.samples, tracks.tracks, strict=False):
         if min(i, j) + by < 0 or max(i, j) + by >= len(poses.t):
             continue
         T = se3.relative(*(poses[k + by : k + by + 1].map(lambda x: x.double()) for k in (i, j)))

@@ -102,23 +102,12 @@ def rot90_map(depth: Tensor, quarters: int) -> Tensor:
     return F.interpolate(flat, depth.shape[-2:], mode="nearest-exact").reshape(depth.shape)
 
 
-def _registration_name(field: float) -> str:
-    """Name of the registration fault with that field of view; the first and the last one tried are bounds."""
-    bound = {FIELD_OF_VIEW_RATIOS[0]: "at most ", FIELD_OF_VIEW_RATIOS[-1]: "at least "}.get(field, "")
-    return f"not registered: seen over {bound}{field:.2f} of the picture's field"
-
-
 def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
     """Lengths (B, h, w) of the viewing rays with z = 1 through a map's pixels: distance over depth. Gradient: none."""
     v, u = torch.meshgrid(*(torch.arange(n, device=camera.f.device) for n in hw), indexing="ij")
     uv = torch.stack((u, v), -1).view(1, -1, 2).expand(len(camera.f), -1, -1).to(camera.f)
     with torch.no_grad():
         return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
-
-
-def _inverse(depth: Tensor) -> Tensor:
-    """Reciprocal of a map (…, h, w); 0 where it has no value."""
-    return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
 
 
 #: Hypothesis without a fault.
@@ -130,11 +119,22 @@ KNOWN_FAULTS: tuple[KnownFault, ...] = (
     KnownFault("mirrored", "mirrored left to right", partial(torch.flip, dims=(-1,))),
     KnownFault("mirrored", "mirrored upside down", partial(torch.flip, dims=(-2,))),
     KnownFault("along the ray", "distance along the ray, not depth", ray=True),
-    KnownFault("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
+    KnownFault(
+        "inverse",
+        "inverse depth or disparity, not depth",
+        scaled=True,
+        undo=lambda depth: depth.reciprocal().where(depth > 0, 0.0),
+    ),
     *(KnownFault("rolled", f"rolled by {90 * k} degrees", partial(rot90_map, quarters=4 - k)) for k in (1, 2, 3)),
     *(
-        KnownFault("registration", _registration_name(field), partial(rescale_field_of_view, factor=field))
-        for field in FIELD_OF_VIEW_RATIOS
+        KnownFault(  # the first and the last field tried are bounds
+            "registration",
+            f"not registered: seen over {bound}{field:.2f} of the picture's field",
+            partial(rescale_field_of_view, factor=field),
+        )
+        for field, bound in zip(
+            FIELD_OF_VIEW_RATIOS, ("at most ", *[""] * (len(FIELD_OF_VIEW_RATIOS) - 2), "at least "), strict=True
+        )
     ),
     *(
         KnownFault(
@@ -314,30 +314,23 @@ def select_cause(losses: Mapping[str, Tensor], options: ValidationOptions = DEFA
     base = losses[NO_FAULT.name]
     valid = base.isfinite()
     mean = {name: float(loss[valid & loss.isfinite()].mean()) for name, loss in losses.items()}
-    no_cause = Diagnosis(
-        None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(valid.sum())
-    )
-    saved = {
-        name: (base - loss)[base.isfinite() & loss.isfinite()] for name, loss in losses.items() if name != NO_FAULT.name
-    }
-    saved = {name: differences for name, differences in saved.items() if len(differences) >= options.min_window_pairs}
+    finite = {name: value for name, value in mean.items() if math.isfinite(value)}
+    no_cause = Diagnosis(None, None, finite, int(valid.sum()))
+    differences = {name: base - loss for name, loss in losses.items() if name != NO_FAULT.name}
+    saved = {name: x[x.isfinite()] for name, x in differences.items()}
+    saved = {name: x for name, x in saved.items() if len(x) >= options.min_window_pairs}
     if not saved:
         return no_cause
     best = max(saved, key=lambda name: float(saved[name].mean()))
     error = float(saved[best].std() / len(saved[best]) ** 0.5)
-    margins = [_mean_over_common_pairs(losses[name] - losses[best]) for name in saved if kinds[name] != kinds[best]]
+    # Over the pairs with both losses, since some pairs are easier; NaN without any.
+    margins = [float((losses[name] - losses[best]).nanmean()) for name in saved if kinds[name] != kinds[best]]
     is_clear = float(saved[best].mean()) > max(options.min_loss_saved, options.min_standard_errors * error)
     return (
         no_cause._replace(cause=best, kind=kinds[best])
-        if is_clear and all(margin > options.min_margin_over_others for margin in margins)
+        if is_clear and not any(margin <= options.min_margin_over_others for margin in margins)
         else no_cause
     )
-
-
-def _mean_over_common_pairs(difference: Tensor) -> float:
-    """Mean difference of two losses over the pairs with both, since some pairs are easier; infinite without any."""
-    valid = difference[difference.isfinite()]
-    return float(valid.mean()) if len(valid) else math.inf
 
 
 class WindowTracks(NamedTuple):
@@ -359,10 +352,6 @@ class SampleLosses:
     def mean(self) -> Tensor:
         """(P,) mean over the used samples; NaN where it is not defined or of too few samples."""
         return torch.where(self.defined, _mean_loss(self.loss, self.used), torch.nan)
-
-    def replace(self, **fields: Tensor) -> SampleLosses:
-        """These losses with other fields."""
-        return replace(self, **fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,7 +426,7 @@ class FaultWindow:
             return self.loss(cause)
         losses = self.sample_losses(cause)
         both = base.used & losses.used
-        return base.mean() + losses.replace(used=both).mean() - base.replace(used=both).mean()
+        return base.mean() + replace(losses, used=both).mean() - replace(base, used=both).mean()
 
     def sample_losses(
         self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
@@ -473,8 +462,8 @@ class FaultWindow:
         trajectory = self._losses_under_trajectory(depth, views)
         if trajectory is not None:
             fitted = torch.where(losses.used & losses.defined[:, None], losses.loss, 1.0)
-            losses = trajectory.replace(loss=0.5 * (fitted + trajectory.loss))
-        return losses.replace(defined=losses.defined & in_window)
+            losses = replace(trajectory, loss=0.5 * (fitted + trajectory.loss))
+        return replace(losses, defined=losses.defined & in_window)
 
     @staticmethod
     def _scaled(frame: Frame, factor: float) -> Frame:
@@ -494,8 +483,8 @@ class FaultWindow:
         is_static = fit.t_snr < 3
         losses = self._reprojection_losses(depth, usable, fit.T_1_from_0, cameras)
         if self.maps is None:
-            return losses.replace(loss=torch.where(fit.ok[:, None], losses.loss, 1.0))
-        return losses.replace(defined=fit.ok & ~is_static)
+            return replace(losses, loss=torch.where(fit.ok[:, None], losses.loss, 1.0))
+        return replace(losses, defined=fit.ok & ~is_static)
 
     def _losses_under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> SampleLosses | None:
         """Losses under the motions of the frames' own poses; None where they have none."""

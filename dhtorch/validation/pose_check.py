@@ -233,17 +233,17 @@ def check_poses(
                 surface[k, place] = depth_disagreement(returns, frames[j], motions)
             if tracks:
                 track[k, place] = _track_loss(*tracks[k], frames[i], frames[j], motions)
-    median = _median_over_pairs(surface)
+    median, mean = _over_pairs(surface, surface.nanmedian(0).values), _over_pairs(track, track.nanmean(0))
     scores = _reading_scores(readings, median)
     if scores is None:
         return None
     is_tracked = int(track.isfinite().any(1).sum()) >= _MIN_DECIDING_PAIRS
     return PoseCheck(
         surfaces=scores,
-        tracks=_reading_scores(readings, _mean_over_pairs(track)) if is_tracked else None,
+        tracks=_reading_scores(readings, mean) if is_tracked else None,
         surface_factor=_distinguishable_factor(readings, median, surface),
         n_pairs=int(surface[:, 0].isfinite().sum()),
-        scale_error=_unnoticed_scale_error(readings, median, _mean_over_pairs(track) if is_tracked else None),
+        scale_error=_unnoticed_scale_error(readings, median, mean if is_tracked else None),
     )
 
 
@@ -321,7 +321,9 @@ def describe_contradiction(check: PoseCheck, unit: DepthUnit | None = None) -> t
     if reading.factor == 1 or isinstance(reading.convention.unit, str):
         return f"{start}: these look like {reading.convention.describe()}", option
     text = f"{start}: translations are {1 / reading.factor:.3g} times what the depth has"
-    other = _other_depth_unit(reading.factor, unit)
+    # A common depth unit, metres of one step, with which translations would agree
+    metres = math.nan if unit is None else unit.metres / reading.factor
+    other = next((x for x in _COMMON_DEPTH_UNITS_M if abs(math.log(x / metres)) < math.log(1.06)), None)
     if other is not None:
         return f"{text}; the depth unit may be {format_unit(other)}", f"data.depth_unit={other:.6g}"
     return f"{text}: the unit of the depth or of the poses is another one", option
@@ -347,14 +349,6 @@ def describe_factor(check: PoseCheck) -> str:
         f"depth is {check.factor:.2f} times what the poses' translations imply: the depth unit, the focal length "
         "or the scale of the poses is wrong; which one, depth and poses alone do not show"
     )
-
-
-def _other_depth_unit(factor: float, unit: DepthUnit | None) -> float | None:
-    """A common depth unit, metres of one step, with which translations would agree; None if there is none."""
-    if unit is None:
-        return None
-    wanted = unit.metres / factor
-    return next((each for each in _COMMON_DEPTH_UNITS_M if abs(math.log(each / wanted)) < math.log(1.06)), None)
 
 
 def _distinguishable_factor(readings: Sequence[PoseReading], median: Tensor, disagreements: Tensor) -> float:
@@ -406,16 +400,10 @@ def _relative_poses(poses: Pose, i: int, j: int, readings: Sequence[PoseReading]
     return torch.tensor(place), Pose(torch.cat([m.R for m in motions]), torch.cat([m.t for m in motions]))
 
 
-def _median_over_pairs(values: Tensor) -> Tensor:
-    """Medians (H,) of (K, H) over the pairs; NaN where less than half of the pairs have a value."""
+def _over_pairs(values: Tensor, summary: Tensor) -> Tensor:
+    """Summary (H,) of values (K, H) over the pairs; NaN where less than half of the pairs have a value."""
     enough = 2 * values.isfinite().sum(0) >= max(1, int(values.isfinite().any(1).sum()))
-    return torch.where(enough, values.nanmedian(0).values, torch.nan)
-
-
-def _mean_over_pairs(values: Tensor) -> Tensor:
-    """Means (H,) of (K, H) over the pairs; NaN where less than half of the pairs have a value."""
-    enough = 2 * values.isfinite().sum(0) >= max(1, int(values.isfinite().any(1).sum()))
-    return torch.where(enough, values.nanmean(0), torch.nan)
+    return torch.where(enough, summary, torch.nan)
 
 
 def _or_infinite(value: float) -> float:

@@ -13,7 +13,7 @@ sensor's own, a wrong scale is common to the map and to all references, and only
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -100,23 +100,28 @@ def validate_depth(
     check("validate_depth", depth=(reference.depth, "B y x"), depth_map=(depth_map, "B h w"))
     check("validate_depth", other_maps=(other_maps, "V B h w"))
     for name, maps in (("depth_map", depth_map), ("other_maps", other_maps)):
-        _check_map(name, maps)
+        if maps is not None and (maps.dtype == torch.bool or maps.is_complex()):
+            kind = str(maps.dtype).removeprefix("torch.")
+            raise ValueError(f"validate_depth: {name} is of {kind}, expected real numbers, m")
+        if maps is not None and min(maps.shape[-2:]) < 2:
+            raise ValueError(f"validate_depth: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
     trace = {} if trace is None else trace
     with torch.no_grad():
         selected_views = (
             None if others is None else _estimate_views(method, reference, others, trace, seed=seed, fit=fit, hint=hint)
         )
-        view_index = trace["choice"].index if "choice" in trace else None
-        map_args: dict[str, Any] = {"views": views, "source_views": source_views, "size": size, "tolerance": tolerance}
         return validate_against(
             depth_map,
             reference,
             selected_views,
-            view_index,
+            trace["choice"].index if "choice" in trace else None,
             other_maps=other_maps,
             method=method,
+            views=views,
+            source_views=source_views,
+            size=size,
+            tolerance=tolerance,
             options=options,
-            **map_args,
         )
 
 
@@ -160,65 +165,78 @@ def validate_against(
     sparse = evidence.sparse_evidence(
         grid, reference.hw, points, allowed_sigma, None if is_sensor_map else returns, options
     )
-    kinds = [sparse]
     nothing = evidence.no_evidence(grid)
+    photometric = consistency = nothing
     flying = outlines = wrong_causes.RefutedPixels(nothing.misfit, nothing.view, nothing.sure)
     if selected is not None and views:
-        number = (
-            offered if offered is not None else torch.arange(len(selected.fits.code))[:, None].expand(-1, len(grid))
+        n = len(selected.fits.code)
+        number = torch.arange(n)[:, None].expand(-1, len(grid)) if offered is None else offered
+        maps = None if is_sensor_map else other_maps
+        photometric, consistency, outlines = _evidence_of_views(
+            grid,
+            reference,
+            selected,
+            number.to(grid.device),
+            maps=maps,
+            is_sensor_map=is_sensor_map,
+            most=source_views,
+            allowed_sigma=allowed_sigma,
+            options=options,
         )
-        source_maps = None if is_sensor_map else other_maps
-        validated = _ValidatedMap(grid, reference, selected, number.to(grid.device), is_sensor_map)
-        kinds += _view_evidences(validated, source_maps, source_views, allowed_sigma, options)
         flying = _flying_pixels(grid, depth_map, allowed_sigma, options)
-        outlines = _outline_evidence(validated, options)
         # Between two pixels of a coarser map an outline lies anywhere.
         is_between = resolution > tolerance
         outlines = outlines._replace(
             misfit=outlines.misfit.masked_fill(is_between, torch.nan), unsupported=outlines.unsupported & ~is_between
         )
-    no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
-    scale_vs_trajectory = no_scale if selected is None else _scale_vs_trajectory(reference, selected, options)
-    numbers = _frame_numbers(grid, reference, points, is_sensor_map, options)
-    point_depth = evidence.triangulated_depth(grid, reference.hw, points, options)
     agrees = torch.zeros_like(flying.unsupported)
     if not is_sensor_map:
         ratio = torch.where(returns.usable, grid / torch.where(returns.usable, returns.depth, 1.0), 0.0)
         agrees = ratio.clamp_min(1e-6).log().abs() < options.supporting_evidence_sigmas * allowed_sigma
-    parts = _OutlineParts(flying, outlines, point_depth, agrees)
-    return _assemble_validation(grid, kinds, parts, (numbers, scale_vs_trajectory), is_sensor_map, options)
+    combined = combine_evidence(sparse, photometric, consistency, options=options)
+    clip_depth, at_clip_depth = clipped_depth(grid, *combined[:2], options)
+    is_flying, at_outline, state, misfit, view = _refute_outlines(combined, flying, outlines, agrees, options)
+    state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
+    n_wrong, n_known = (
+        (m.sum((1, 2)) / options.share_window_pixels) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
+    )
+    point_depth = evidence.triangulated_depth(grid, reference.hw, points, options)
+    no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
+    by_trajectory = no_scale if selected is None else _scale_vs_trajectory(reference, selected, options)
+    scale, near, far, shift, tilt = _frame_numbers(grid, reference, points, is_sensor_map, options)
+    return DepthValidation(
+        depth=grid,
+        state=state,
+        evidence=misfit,
+        view=view,
+        sparse_evidence=sparse.misfit,
+        photometric_evidence=photometric.misfit,
+        consistency_evidence=consistency.misfit,
+        outline_evidence=at_outline,
+        cause=wrong_causes.name_causes(grid, state, misfit, point_depth, is_flying, options),
+        scale=by_trajectory if is_sensor_map else scale,
+        scale_near=near,
+        scale_far=no_scale if is_sensor_map else far,
+        scale_vs_trajectory=by_trajectory,
+        shift=shift,
+        tilt=tilt,
+        wrong=share_interval(n_wrong.to(grid), n_known.to(grid)),
+        clip_depth=clip_depth,
+    )
 
 
-class _OutlineParts(NamedTuple):
-    """What decides the causes of wrong pixels."""
-
-    flying: wrong_causes.RefutedPixels
-    outlines: wrong_causes.RefutedPixels
-    point_depth: Tensor  # (B, h, w) m, of triangulated points
-    agrees: Tensor  # (B, h, w) bool, with a near return at the pixel itself, of another sensor than the map
-
-
-class _ValidatedMap(NamedTuple):
-    """A map on the validation grid with the selected source views."""
-
-    grid: Tensor  # (B, h, w) m
-    reference: Frame
-    selected: dense.SelectedViews
-    number: Tensor  # (views, B) index of the selected views among those passed
-    is_sensor_map: bool
-
-    def top_views(self, most: int) -> tuple[plane_sweep.ReferenceView, Tensor, list[SourceView]]:
-        """The reference view on the grid, and the ``most`` informative selected views: their index and pictures."""
-        selected = self.selected
-        base = plane_sweep.make_reference_view(*dense.downscale_grey(self.reference, max(self.grid.shape[-2:])))
-        index, use_view = dense.top_views(selected, most)
-        has_baseline = selected.fits.t_snr > 5  # the translation is significant
-        use_view = selected.fits.ok.gather(0, index) & (use_view | has_baseline.gather(0, index))
-        views = [
-            dense.source_view_of(selected, k, max(base.hw), use, base.image)
-            for k, use in zip(index, use_view, strict=True)
-        ]
-        return base, index, views
+def _top_views(
+    grid: Tensor, reference: Frame, selected: dense.SelectedViews, most: int
+) -> tuple[plane_sweep.ReferenceView, Tensor, list[SourceView]]:
+    """The reference view on the grid, and the ``most`` informative selected views: their index and images."""
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, max(grid.shape[-2:])))
+    index, use_view = dense.top_views(selected, most)
+    has_baseline = selected.fits.t_snr > 5  # the translation is significant
+    use_view = selected.fits.ok.gather(0, index) & (use_view | has_baseline.gather(0, index))
+    views = [
+        dense.source_view_of(selected, k, max(base.hw), use, base.image) for k, use in zip(index, use_view, strict=True)
+    ]
+    return base, index, views
 
 
 def _estimate_views(
@@ -232,37 +250,38 @@ def _estimate_views(
     return dense.selected_views(estimate, others, trace)
 
 
-def _view_evidences(
-    validated: _ValidatedMap,
-    other_maps: Tensor | None,
-    source_views: int,
-    tolerance: Tensor,
+def _evidence_of_views(
+    grid: Tensor,
+    reference: Frame,
+    selected: dense.SelectedViews,
+    number: Tensor,  # (views, B) index of the selected views among those passed
+    *,
+    maps: Tensor | None,
+    is_sensor_map: bool,
+    most: int,
+    allowed_sigma: Tensor,
     options: ValidationOptions,
-) -> tuple[Evidence, Evidence]:
-    """Photometric and depth consistency evidence of the most informative views, numbered among the views passed."""
-    grid, selected = validated.grid, validated.selected
-    base, index, source_view_list = validated.top_views(source_views)
-    pictures = evidence.photometric_evidence(grid, base, source_view_list, tolerance, options)
+) -> tuple[Evidence, Evidence, wrong_causes.RefutedPixels]:
+    """Photometric and depth consistency evidence of the most informative views, and evidence at outlines from all views
+    with a motion, numbered among the views passed."""
+    base, index, views = _top_views(grid, reference, selected, most)
+    places = number.gather(0, index)
+    photometric = evidence.photometric_evidence(grid, base, views, allowed_sigma, options)
+    consistency = evidence.no_evidence(grid)
     batch = torch.arange(len(grid), device=grid.device)
-    number = validated.number.gather(0, index)
-    maps = evidence.no_evidence(grid)
-    if validated.is_sensor_map or other_maps is not None:
-        if validated.is_sensor_map:
-            depths = [_sensor_map(selected.frames[k, batch], base.hw) for k in index]
-        else:
-            assert other_maps is not None
-            depths = [_nearest_surfaces(other_maps.to(grid)[n, batch], base.hw) for n in number]
-        maps = evidence.depth_consistency_evidence(
-            grid, base, source_view_list, [_finite_positive(depth) for depth in depths], tolerance, options
-        )
-    return tuple(kind._replace(view=_renumber_views(kind.view, number)) for kind in (pictures, maps))  # type: ignore[return-value]
-
-
-def _outline_evidence(validated: _ValidatedMap, options: ValidationOptions) -> wrong_causes.RefutedPixels:
-    """Evidence at outlines from all views with a motion, numbered among the views passed."""
-    base, index, source_view_list = validated.top_views(len(validated.selected.fits.code))
-    at_outlines = wrong_causes.outline_evidence(validated.grid, base, source_view_list, options)
-    return at_outlines._replace(view=_renumber_views(at_outlines.view, validated.number.gather(0, index)))
+    depths = [] if maps is None else [_nearest_surfaces(maps.to(grid)[n, batch], base.hw) for n in places]
+    if is_sensor_map:
+        depths = [_sensor_map(selected.frames[k, batch], base.hw) for k in index]
+    if depths:
+        depths = [_finite_positive(depth) for depth in depths]
+        consistency = evidence.depth_consistency_evidence(grid, base, views, depths, allowed_sigma, options)
+    base, index, views = _top_views(grid, reference, selected, len(selected.fits.code))
+    outlines = wrong_causes.outline_evidence(grid, base, views, options)
+    return (
+        photometric._replace(view=_renumber_views(photometric.view, places)),
+        consistency._replace(view=_renumber_views(consistency.view, places)),
+        outlines._replace(view=_renumber_views(outlines.view, number.gather(0, index))),
+    )
 
 
 def _flying_pixels(
@@ -292,18 +311,6 @@ def _finite_positive(depth: Tensor) -> Tensor:
     """Depth with 0 where it is not finite or not positive."""
     depth = depth.nan_to_num(0.0, 0.0, 0.0)
     return torch.where(depth > 0, depth, 0.0)
-
-
-def _check_map(name: str, maps: Tensor | None) -> None:
-    """ValueError where maps are no real numbers or too small."""
-    if maps is None:
-        return
-    if maps.dtype == torch.bool or maps.is_complex():
-        raise ValueError(
-            f"validate_depth: {name} is of {str(maps.dtype).removeprefix('torch.')}, expected real numbers, m"
-        )
-    if min(maps.shape[-2:]) < 2:
-        raise ValueError(f"validate_depth: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
 
 
 def _resize_nearest(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
@@ -336,50 +343,11 @@ def _sensor_map(frame: Frame, hw: tuple[int, int]) -> Tensor:
 # -------------------------------------------------------------------------------------------------------------- states
 
 
-def _assemble_validation(
-    grid: Tensor,
-    kinds: Sequence[Evidence],
-    parts: _OutlineParts,
-    frame_numbers: tuple[FrameNumbers, Tensor],
-    is_sensor_map: bool,
-    options: ValidationOptions,
-) -> DepthValidation:
-    """Evidence, numbers of the frame and the scale against the trajectory -> DepthValidation; photometric and
-    consistency evidence may be missing."""
-    numbers, scale_vs_trajectory = frame_numbers
-    state, misfit, view = combine_evidence(*kinds, options=options)
-    clip_depth, at_clip_depth = clipped_depth(grid, state, misfit, options)
-    is_flying, at_outline, state, misfit, view = _refute_outlines((state, misfit, view), parts, options)
-    state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
-    sparse, photometric, consistency = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
-    no_scale = torch.full_like(scale_vs_trajectory, torch.nan)
-    n_wrong, n_known = (
-        (m.sum((1, 2)) / options.share_window_pixels) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
-    )
-    return DepthValidation(
-        depth=grid,
-        state=state,
-        evidence=misfit,
-        view=view,
-        sparse_evidence=sparse.misfit,
-        photometric_evidence=photometric.misfit,
-        consistency_evidence=consistency.misfit,
-        outline_evidence=at_outline,
-        cause=wrong_causes.name_causes(grid, state, misfit, parts.point_depth, is_flying, options),
-        scale=scale_vs_trajectory if is_sensor_map else numbers.scale,
-        scale_near=numbers.near,
-        scale_far=no_scale if is_sensor_map else numbers.far,
-        scale_vs_trajectory=scale_vs_trajectory,
-        shift=numbers.shift,
-        tilt=numbers.tilt,
-        wrong=share_interval(n_wrong.to(grid), n_known.to(grid)),
-        clip_depth=clip_depth,
-    )
-
-
 def _refute_outlines(
     combined: tuple[Tensor, Tensor, Tensor],
-    parts: _OutlineParts,
+    flying: wrong_causes.RefutedPixels,
+    outlines: wrong_causes.RefutedPixels,
+    agrees: Tensor,  # (B, h, w) bool, with a near return at the pixel itself, of another sensor than the map
     options: ValidationOptions,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """State, misfit and view of the other evidence, changed where flying pixels or the surface beyond an outline refute
@@ -389,13 +357,13 @@ def _refute_outlines(
     little better than the surface beyond the outline. Where a near return at the pixel itself agrees, nothing changes.
     """
     state, misfit, view = combined
-    is_flying = parts.flying.misfit.isfinite()
+    is_flying = flying.misfit.isfinite()
     at_outline, outline_view, unsupported = (
-        torch.where(is_flying, a, b) for a, b in zip(parts.flying, parts.outlines, strict=True)
+        torch.where(is_flying, a, b) for a, b in zip(flying, outlines, strict=True)
     )
-    refuted = (at_outline.abs() > options.refuting_evidence_sigmas) & ~parts.agrees
+    refuted = (at_outline.abs() > options.refuting_evidence_sigmas) & ~agrees
     new = refuted & (state != State.WRONG)
-    unsupported = (state == State.CONSISTENT) & unsupported & ~parts.agrees
+    unsupported = (state == State.CONSISTENT) & unsupported & ~agrees
     state = torch.where(new, State.WRONG, torch.where(unsupported, State.CANNOT_KNOW, state)).to(torch.int32)
     return is_flying, at_outline, state, torch.where(new, at_outline, misfit), torch.where(new, outline_view, view)
 
@@ -464,20 +432,11 @@ def share_interval(part: Tensor, whole: Tensor) -> Tensor:
     return torch.where((whole > 0)[:, None], out, torch.nan)
 
 
-class FrameNumbers(NamedTuple):
-    """Numbers of a frame as a whole, (B, 3) each: value, low, high."""
-
-    scale: Tensor
-    near: Tensor
-    far: Tensor
-    shift: Tensor
-    tilt: Tensor
-
-
 def _frame_numbers(
     grid: Tensor, reference: Frame, points: ValidationReferences, is_sensor_map: bool, options: ValidationOptions
-) -> FrameNumbers:
-    """Map and sparse references -> scale, shift and tilt with intervals."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Map and sparse references -> scale, that of near and of far references, shift and tilt, (B, 3) each: value, low,
+    high."""
     h, w = grid.shape[-2:]
     depth_at, inside = sample_nearest(grid, cam.resize_pixels(points.uv, reference.hw, (h, w)))
     used = points.used & inside & (depth_at > 0)
@@ -493,8 +452,8 @@ def _frame_numbers(
     both = _inverse_variance_mean(near, far)
     if is_sensor_map:
         near = both = (torch.full_like(near[0], torch.nan), near[1])
-    shift, tilt = _shift_and_tilt(ratio, points, used, own_sigma, reference.hw, options)
-    return FrameNumbers(_factor_interval(*both), _factor_interval(*near), _factor_interval(*far), shift, tilt)
+    shape = _shift_and_tilt(ratio, points, used, own_sigma, reference.hw, options)
+    return (*(_factor_interval(*of) for of in (both, near, far)), *shape)  # type: ignore[return-value]
 
 
 def _robust_mean(
