@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,11 @@ def write_collection(path: Path, results: dict[str, list[Any]]) -> None:
 def percent(value: float | None, decimals: int = 1) -> str:
     """A fraction as text."""
     return "–" if value is None else f"{100 * value:.{decimals}f} %"
+
+
+def percents(values: Iterable[float | None]) -> str:
+    """Several fractions as text, with one unit."""
+    return f"{' / '.join(percent(value).removesuffix(' %') for value in values)} %"
 
 
 def number(value: float | None, decimals: int = 2) -> str:

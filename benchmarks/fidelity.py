@@ -104,7 +104,11 @@ FINDINGS: tuple[Finding, ...] = (
 def table() -> str:
     """The page's table, in Markdown."""
     head = ["paper", "line", "figure", "paper", "here", "95 % interval", "n", "deviation", "file"]
-    return markdown(head, list(_cells()), n_label=3)
+    rows = list(_cells())
+    places = ["", *(row[0] for row in rows)]  # a place of the paper stands at its first line
+    return markdown(
+        head, [[row[0] * (row[0] != last), *row[1:]] for row, last in zip(rows, places, strict=False)], n_label=3
+    )
 
 
 def _cells() -> Iterator[list[str]]:
@@ -120,7 +124,7 @@ def _cells() -> Iterator[list[str]]:
             finding.metric,
             printed,
             _format(entry["value"], metric),
-            EMPTY_CELL if EMPTY_CELL in interval else " to ".join(interval),
+            EMPTY_CELL if EMPTY_CELL in interval else "…".join((interval[0].removesuffix(" %"), interval[1])),
             str(entry.get("n") or EMPTY_CELL),
             _deviation(printed, entry["value"], metric),
             f"`{finding.result}`",

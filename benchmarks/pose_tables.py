@@ -6,7 +6,7 @@ import statistics
 from functools import partial
 from typing import Any
 
-from cells import percent, read, table
+from cells import percent, percents, read, table
 
 from dhtorch.runtime.console import format_count
 
@@ -21,7 +21,7 @@ def given_poses() -> str:
         right = {row["use"]: row for row in runs if row["pose"] in ("right", "none")}
         name = f"`{scene}`" + (" (turns only)" if runs[0]["role"] == "rotation" else "")
         uses = [right["near returns"], *(right[use] for use in USED)]
-        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel", "within_2sigma")]
+        cells = [percents(row[key] for row in uses) for key in ("coverage", "median_rel", "within_2sigma")]
         rows.append([name, str(right["near returns"]["n_candidates"]), *cells])
     head = f"near returns / {' / '.join(USED.values())}"
     return table(["capture", "held back", f"answered: {head}", "median error", "within 2 sigma"], rows)

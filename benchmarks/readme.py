@@ -29,7 +29,7 @@ import pose_tables
 import reader_tables
 import reproduce
 import speed_tables
-from cells import RESULTS, load, names_read, number, percent, read, summary_value, table, table_of_bars
+from cells import RESULTS, load, names_read, number, percent, percents, read, summary_value, table, table_of_bars
 
 from dhtorch.experiments.compare import method_comparison
 from dhtorch.experiments.report import layouts, text
@@ -170,7 +170,7 @@ def by_scene(comparison: str) -> str:
         cells = [name, str(methods["paper"]["n_candidates"])]
         shown = [m for m in ("paper", "opencv", *COMPARED) if m in methods]
         for key in ("coverage", "median_rel"):
-            cells.append(" / ".join(percent(methods[m].get(key)) for m in shown))
+            cells.append(percents(methods[m].get(key) for m in shown))
         ratios = [
             methods[m].get("against_paper", {}).get("median_rel_ratio_at_equal_coverage")
             for m in COMPARED
@@ -502,6 +502,8 @@ def validated_real() -> str:
         options = f" {' '.join(row['options'])}" if row["options"] else ""
         cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{limited['unknown']:.1%}"]
         rows.append([*cells, causes or ("no window" if not whole["windows"] else "none")])
+        if len(rows) > 1 and rows[-1][1:] == rows[-2][1:]:  # captures with the same results share a row
+            rows[-2:] = [[f"{rows[-2][0].partition(', … ')[0]}, … {cells[0]}", *rows[-1][1:]]]
     return table(["capture", "frames", "wrong, of validated pixels", "unknown", "likely cause (windows)"], rows)
 
 
@@ -777,9 +779,8 @@ def _written(name: str) -> str:
     if name == "make: experiments":  # of docs/hooks.py, with every archived answer
         names_read.update(archived_answers())
     old = sorted(name for name in names_read if reproduce.other_settings(name))
-    files = ", ".join(f"`{each}.json`" for each in old)
-    note = f"\n\n*Made with the settings of an earlier release, not of this one: {files}. "
-    note += f"`python benchmarks/reproduce.py {' '.join(old)}` makes them again.*"
+    note = "\n\n*Made with the settings of an earlier release, not of this one; again with "
+    note += f"`python benchmarks/reproduce.py {' '.join(old)}`.*"
     return part + note * bool(old)
 
 

@@ -55,8 +55,9 @@ def ratio(value: float) -> str:
 
 
 def errors(row: dict[str, Any]) -> str:
-    """Both sides' errors."""
-    return " / ".join("–" if row[k] is None else f"{row[k]:.3g}" for k in ("ours_error", "peer_error"))
+    """Both sides' errors; a dash where neither has one."""
+    both = ["–" if row[k] is None else f"{row[k]:.3g}" for k in ("ours_error", "peer_error")]
+    return "–" if both == ["–", "–"] else " / ".join(both)
 
 
 def on(file: str, shown: str) -> str:
@@ -163,7 +164,7 @@ def accelerator() -> str:
         ]
         least = min(r["ours_ms"], r["ours_ms"] if graph is None else graph["ours_ms"])
         is_compared = bool(r.get("change_sigma"))  # 0 where the CPU answers nothing
-        flips = [f"{r[k]:.2g}" if is_compared else "–" for k in ("gate_flips", "change_sigma")]
+        flips = [f"{r[k]:.2g}" for k in ("gate_flips", "change_sigma")] if is_compared else ["–"]
         cells = [f"`{name.removeprefix('gpu_').rpartition('_b')[0]}`", str(r["batch"]), f"{r['ours_ms']:.3g}", *others]
         cells += [f"{r['peer_ms']:.3g}", f"{1e3 / least:,.0f}", f"{r['peak_mib']:.0f}", str(r["waits"])]
         rows.append([*cells, errors(r), " / ".join(flips)])

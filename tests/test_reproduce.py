@@ -62,8 +62,8 @@ def test_a_table_from_a_file_with_earlier_settings_has_a_note_that_names_it(part
     ]
     assert blocks, "no page has this part"
     for block in blocks:
-        notes = re.findall(r"\*Made with the settings of an earlier release, not of this one: (.*?)\. ", block)
-        assert {n for note in notes for n in re.findall(r"`(\w+)\.json`", note)} == names
+        notes = re.findall(r"\*Made with the settings of an earlier release, .*?`python \S+ (.*?)`\.\*", block)
+        assert {name for note in notes for name in note.split()} == names
 
 
 def test_a_column_of_the_first_release_is_labelled():
