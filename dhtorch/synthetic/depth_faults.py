@@ -39,18 +39,13 @@ def scale_depth(depth: Tensor, factor: float) -> Tensor:
     return depth * factor
 
 
-def shift_depth(depth: Tensor, shift: float) -> Tensor:
-    """The map with ``shift`` m added to all depths, which remain at least a hundredth of the original."""
-    return torch.where(depth > 0, (depth + shift).clamp_min(0).maximum(0.01 * depth), 0.0)
-
-
 def tilt_depth(depth: Tensor, share: float, angle: float) -> Tensor:
     """The map with depths that grow by the fraction ``share`` across the image, in the direction ``angle`` (rad)."""
     x, y = _pixel_grid(depth)
     return depth * (1 + 0.5 * share * (math.cos(angle) * x + math.sin(angle) * y))
 
 
-def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
+def _warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
     """The map with smooth errors: waves of mean zero and standard deviation ``sigma`` added to its log depth."""
     x, y = _pixel_grid(depth)
     field = torch.zeros_like(x + y)
@@ -62,7 +57,7 @@ def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
     return depth * (sigma * field).exp()
 
 
-def blur_depth(depth: Tensor, share: float = 0.012) -> Tensor:
+def _blur_depth(depth: Tensor, share: float = 0.012) -> Tensor:
     """The map with edges that mix foreground and background: Gaussian mean of the valid depths around each pixel."""
     sigma_px = max(0.5, share * depth.shape[-1])
     valid = (depth > 0).to(depth)
@@ -70,20 +65,20 @@ def blur_depth(depth: Tensor, share: float = 0.012) -> Tensor:
     return torch.where(depth > 0, mean[:, 0], 0.0)
 
 
-def move_objects(depth: Tensor, generator: Generator, *, n: int = 3, factor: float = 3.0) -> Tensor:
-    """The map with ``n`` displaced objects: the pixels around a random pixel, at about its depth, times ``factor``."""
+def _move_objects(depth: Tensor, generator: Generator) -> Tensor:
+    """The map with three displaced objects: the pixels around a random pixel, at about its depth, times three."""
     faulty = depth
-    for u, v in _draw_pixels(depth, generator, n):
+    for u, v in _draw_pixels(depth, generator, 3):
         middle = depth[:, v, u][:, None, None]
         level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < 0.08
         inside = (_pixel_distance(depth, u, v) < 0.12) & level & (depth > 0) & (middle > 0)
-        faulty = torch.where(inside, factor * depth, faulty)
+        faulty = torch.where(inside, 3.0 * depth, faulty)
     return faulty
 
 
-def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
+def _fill_discs(depth: Tensor, generator: Generator) -> Tensor:
     """The map with smoothly invented discs: the blurred surroundings times a smooth factor."""
-    blurred = blur_depth(depth, 0.1)
+    blurred = _blur_depth(depth, 0.1)
     faulty = depth
     for u, v in _draw_pixels(depth, generator, 4):
         off = 0.25 * (2 * float(torch.rand((), generator=generator)) - 1)
@@ -94,9 +89,8 @@ def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
     return faulty
 
 
-def quantise_disparity(depth: Tensor) -> Tensor:
+def _depth_of_steps(depth: Tensor, steps: Tensor) -> Tensor:
     """The map with quantised disparity, as of structured light; no depth below half a disparity step."""
-    steps = (_FOCAL_BASELINE_PX_M / depth.clamp_min(1e-6) / _DISPARITY_STEP_PX).round()
     return torch.where(
         (depth > 0) & (steps >= 1), _FOCAL_BASELINE_PX_M / (steps.clamp_min(1) * _DISPARITY_STEP_PX), 0.0
     )
@@ -107,19 +101,14 @@ def mirror_depth(depth: Tensor) -> Tensor:
     return depth.flip(-1)
 
 
-def roll_depth(depth: Tensor, share: float = 0.1) -> Tensor:
-    """The map rolled to the right by the fraction ``share`` of its width."""
-    return depth.roll(round(share * depth.shape[-1]), -1)
-
-
-def clip_far_depth(depth: Tensor, nearer: float = 0.6) -> Tensor:
-    """The map clipped at the quantile ``nearer`` of its depths, as by a file format with too few bits."""
+def _clip_far_depth(depth: Tensor, _: Generator) -> Tensor:
+    """The map clipped at the quantile 0.6 of its depths, as by a file format with too few bits."""
     valid = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
-    last = (nearer * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
+    last = (0.6 * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
     return depth.minimum(valid.gather(1, last[:, None])[..., None])
 
 
-def mix_outlines(depth: Tensor, generator: Generator) -> Tensor:
+def _mix_outlines(depth: Tensor, generator: Generator) -> Tensor:
     """The map with flying pixels: along outlines, random pixels with a random mean of the foreground's and the
     background's depth."""
     share, weight = torch.rand(2, *depth.shape[-2:], generator=generator, dtype=torch.float64).to(depth)
@@ -129,17 +118,15 @@ def mix_outlines(depth: Tensor, generator: Generator) -> Tensor:
     return torch.where(mixed, weight * near + (1 - weight) * far, depth)
 
 
-def bleed_edges(depth: Tensor, generator: Generator, *, foreground: bool = True) -> Tensor:
-    """The map with a foreground that spreads over its background by two to six pixels, or the reverse."""
+def _bleed_edges(depth: Tensor, generator: Generator) -> Tensor:
+    """The map with a foreground that spreads over its background by two to six pixels."""
     for _ in range(int(torch.randint(2, 7, (), generator=generator))):  # of maps that were upsampled by two to six
-        near, far = _extreme_neighbours(depth)
-        spread = near if foreground else far
-        reached = (spread < depth / _SIDE_RATIO) if foreground else (spread > depth * _SIDE_RATIO)
-        depth = torch.where((depth > 0) & reached, spread, depth)
+        near, _ = _extreme_neighbours(depth)
+        depth = torch.where((depth > 0) & (near < depth / _SIDE_RATIO), near, depth)
     return depth
 
 
-def ghost_returns(depth: Tensor, generator: Generator) -> Tensor:
+def _ghost_returns(depth: Tensor, generator: Generator) -> Tensor:
     """The map with a smooth false depth of 1 to 10 m where the true one is below the sensor's minimum range."""
     low, high = _GHOST_DEPTH_M
     middle, slope = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
@@ -158,34 +145,36 @@ def _extreme_neighbours(depth: Tensor) -> tuple[Tensor, Tensor]:
 NETWORK_FAULTS: dict[str, DepthFault] = {
     "scale_short": lambda depth, _: scale_depth(depth, 0.8),
     "scale_long": lambda depth, _: scale_depth(depth, 1.25),
-    "shift": lambda depth, _: shift_depth(depth, 0.15),
+    "shift": lambda depth, _: torch.where(depth > 0, (depth + 0.15).clamp_min(0).maximum(0.01 * depth), 0.0),
     "tilt": lambda depth, _: tilt_depth(depth, share=0.1, angle=0.6),
-    "warp_small": lambda depth, g: warp_depth(depth, 0.013, g),
-    "warp_large": lambda depth, g: warp_depth(depth, 0.05, g),
-    "simulated": lambda depth, g: scale_depth(warp_depth(depth, 0.013, g), 1.05),
-    "blur": lambda depth, _: blur_depth(depth),
-    "jumps": move_objects,
-    "invented": fill_discs,
-    "quantised": lambda depth, _: quantise_disparity(depth),
+    "warp_small": lambda depth, g: _warp_depth(depth, 0.013, g),
+    "warp_large": lambda depth, g: _warp_depth(depth, 0.05, g),
+    "simulated": lambda depth, g: scale_depth(_warp_depth(depth, 0.013, g), 1.05),
+    "blur": lambda depth, _: _blur_depth(depth),
+    "jumps": _move_objects,
+    "invented": _fill_discs,
+    "quantised": lambda depth, _: _depth_of_steps(
+        depth, (_FOCAL_BASELINE_PX_M / depth.clamp_min(1e-6) / _DISPARITY_STEP_PX).round()
+    ),
 }
 
 #: Faults of sensors and data sets applied to correct maps.
 FILE_FAULTS: dict[str, DepthFault] = {
     "unit": lambda depth, _: scale_depth(depth, 5.0),
     "mirrored": lambda depth, _: mirror_depth(depth),
-    "rolled": lambda depth, _: roll_depth(depth),
+    "rolled": lambda depth, _: depth.roll(round(0.1 * depth.shape[-1]), -1),
     "wrong_k": lambda depth, _: rescale_field_of_view(depth, factor=1.1),
 }
 DEPTH_FAULTS = NETWORK_FAULTS | FILE_FAULTS
 
 #: Faults of file formats that leave only a lower bound of the depth.
-FORMAT_FAULTS: dict[str, DepthFault] = {"cut": lambda depth, _: clip_far_depth(depth)}
+FORMAT_FAULTS: dict[str, DepthFault] = {"cut": _clip_far_depth}
 
 #: Faults of a sensor at single pixels, by the name of their cause in :class:`dhtorch.codes.WrongCause`.
 RETURN_FAULTS: dict[str, DepthFault] = {
-    "ghost": ghost_returns,
-    "flying_pixel": mix_outlines,
-    "edge_bleed": bleed_edges,
+    "ghost": _ghost_returns,
+    "flying_pixel": _mix_outlines,
+    "edge_bleed": _bleed_edges,
 }
 
 #: The fault of using the map of another frame.

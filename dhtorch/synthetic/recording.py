@@ -21,8 +21,7 @@ from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
-from dhtorch.synthetic.device_trajectory import reported_poses
-from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path
+from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path, reported_poses
 from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDINARY, SURFACE_WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room
 from dhtorch.synthetic.shading import ShadedRoom
@@ -53,7 +52,7 @@ class SyntheticRoom(TruthRecording):
             OpenCV axes in any case).
         trajectory_offset_deg, trajectory_lag_s, trajectory_drift_deg_per_s, trajectory_rotation_noise_deg: errors of
             the frames' trajectory, which ``true_poses`` does not have; see
-            :func:`dhtorch.synthetic.device_trajectory.reported_poses`.
+            :func:`dhtorch.synthetic.paths.reported_poses`.
         name: of the recording.
         true_poses: (n_frames) T_world_from_cam, float64, instead of the path's.
         times: (n_frames) s, float64, instead of the frame rate's.

@@ -47,6 +47,7 @@ from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
 from dhtorch.data.readers.rh20t_set import open_set
 from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
 from dhtorch.records import Pose
+from dhtorch.synthetic.paths import rotation_from_angles
 from dhtorch.synthetic.raycast import Material, Solid, Solids
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.rh20t import write_rh20t
@@ -301,7 +302,7 @@ def _draw_free_view(
         place = [draw.uniform(ROOM_LEFT_M + _WALL_M, ROOM_RIGHT_M - _WALL_M), -draw.uniform(*_HEIGHT_M)]
         place.append(draw.uniform(ROOM_FRONT_M + _WALL_M, ROOM_BACK_M - _WALL_M))
         T = np.eye(4)
-        T[:3, :3] = _rotation_from_angles(draw.uniform(-180, 180), pitch + draw.uniform(-4, 4), 0.0)
+        T[:3, :3] = rotation_from_angles(draw.uniform(-180, 180), pitch + draw.uniform(-4, 4), 0.0)
         T[:3, 3] = place
         ways = (T[:3, :3] @ np.array(corners).T).T
         o, v = ([torch.tensor(c, dtype=torch.float32) for c in x.T] for x in (np.tile(place, (len(ways), 1)), ways))
@@ -318,7 +319,7 @@ def _make_thing(
     yaw: float,
 ) -> Solid:
     """A box with its centre ``at`` and ``size`` (across, down, deep) in camera axes, one copy of the picture a face."""
-    R = T_world_from_cam[:3, :3] @ _rotation_from_angles(yaw, 0.0, 0.0)
+    R = T_world_from_cam[:3, :3] @ np.array(rotation_from_angles(yaw, 0.0, 0.0))
     x, y, z = (T_world_from_cam[:3, :3] @ np.array(at) + T_world_from_cam[:3, 3]).tolist()
     rows = [(a, b, c) for a, b, c in R.tolist()]
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
@@ -348,12 +349,3 @@ def _smooth_ramp(share: float) -> float:
     """Ramp from 0 to 1 as ``share`` goes from 0 to 1, with zero speed and acceleration at the ends."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10 + s * (6 * s - 15))
-
-
-def _rotation_from_angles(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """World from camera: roll about z, then pitch about x (positive: up), then yaw about y (positive: right)."""
-    a, b, c = (math.radians(v) for v in (yaw, pitch, roll))
-    about_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
-    about_x = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
-    about_z = np.array([[math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1]])
-    return about_y @ about_x @ about_z

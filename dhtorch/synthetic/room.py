@@ -16,6 +16,7 @@ import math
 from functools import lru_cache
 from random import Random
 
+from dhtorch.synthetic.paths import rotation_from_angles
 from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_WINDOW, Material, Solid, Triple
 from dhtorch.synthetic.shading import Light, ShadedRoom
 
@@ -96,9 +97,7 @@ def make_box(
     **more: object,
 ) -> Solid:
     """A box of ``size`` (x, up, z) whose lower side is ``height`` above the floor; angles in degrees."""
-    a, b = math.radians(yaw), math.radians(pitch)
-    ca, sa, cb, sb = math.cos(a), math.sin(a), math.cos(b), math.sin(b)
-    R = ((ca, sa * sb, sa * cb), (0.0, cb, -sb), (-sa, ca * sb, ca * cb))
+    R = tuple(map(tuple, rotation_from_angles(yaw, pitch, 0.0)))
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
     return Solid((x, -height - half[1], z), half, surface, R, **more)  # type: ignore[arg-type]
 

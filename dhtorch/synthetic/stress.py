@@ -253,21 +253,14 @@ def open_stress(
     """
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
-    rooms = [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
-    return [_to_scene(room, near, gap) for room in rooms]
-
-
-def _to_scene(room: StressRoom, near: float, gap: int) -> Scene:
-    moving, turn = STRESSES[room.stress].moving, STRESSES[room.stress].turn
-    if turn is not None:
-        return replace(room_to_scene(room, min(near, turn.near), gap), role="rotation")
-    if moving is None:
-        return room_to_scene(room, near, gap)
-    return replace(room_to_scene(room, min(near, moving.near), gap), role="moving")
-
-
-def _keep_all(room: StressRoom, i: int, frame: Frame) -> Frame:
-    return frame
+    scenes = []
+    for name in names:
+        room, (_, _, moving, turn) = StressRoom(name, places=places, n_places=n_places, **options), STRESSES[name]
+        near_of = min(near, *(of.near for of in (moving, turn) if of is not None), math.inf)
+        role = "rotation" if turn is not None else "moving" if moving is not None else None
+        scene = room_to_scene(room, near_of, gap)
+        scenes.append(scene if role is None else replace(scene, role=role))
+    return scenes
 
 
 def _keep_one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
@@ -379,7 +372,7 @@ class Stress(NamedTuple):
     """A stress: options of the room, a change of its frames, and a moving body."""
 
     options: dict[str, Any]
-    spoil: Callable[[StressRoom, int, Frame], Frame] = _keep_all
+    spoil: Callable[[StressRoom, int, Frame], Frame] = lambda room, i, frame: frame
     moving: MovingBody | None = None
     turn: HandTurn | None = None
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from random import Random
 
 import torch
 
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Pose
+from dhtorch.synthetic.paths import rotation_from_angles
 from dhtorch.synthetic.recording import SyntheticRoom, phone_camera
 from dhtorch.synthetic.room import ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
 
@@ -67,9 +67,9 @@ def _draw_pose(room: int, camera: Camera, hw: tuple[int, int], draw: Random) -> 
     camera = resize(camera, hw, small)
     while True:
         x, z = draw.uniform(ROOM_LEFT_M + 0.5, ROOM_RIGHT_M - 0.5), draw.uniform(ROOM_FRONT_M + 0.4, ROOM_BACK_M - 0.8)
-        yaw, pitch = math.radians(draw.uniform(-180, 180)), math.radians(draw.uniform(-22, 4))
-        ca, sa, cb, sb = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
-        R = torch.tensor([[[ca, sa * sb, sa * cb], [0.0, cb, -sb], [-sa, ca * sb, ca * cb]]], dtype=torch.float64)
+        R = torch.tensor(
+            [rotation_from_angles(draw.uniform(-180, 180), draw.uniform(-22, 4), 0.0)], dtype=torch.float64
+        )
         pose = Pose(R, torch.tensor([[x, -draw.uniform(0.9, 1.7), z]], dtype=torch.float64))
         depth, _ = solids.view(camera, pose, small)
         if float(depth.sort().values[len(depth) // 100]) > _MIN_DEPTH_M:

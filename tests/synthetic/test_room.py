@@ -12,8 +12,7 @@ from torch.nn.functional import grid_sample, max_pool2d, pad, unfold
 from dhtorch.geometry import camera, se3
 from dhtorch.pytree import collate
 from dhtorch.synthetic import depth_faults as faults
-from dhtorch.synthetic.device_trajectory import reported_poses
-from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path
+from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path, reported_poses
 from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDINARY, SURFACE_WINDOW
 from dhtorch.synthetic.recording import SURFACE_NAMES, SyntheticRoom, open_room, simulate_phone_lidar
 from dhtorch.synthetic.room import _ROOM_HEIGHT_M, ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
@@ -345,7 +344,7 @@ def test_sizes_of_faults():
     for found, expected in (
         (faults.apply_fault("unit", WALL)[0], 5 * WALL),
         (faults.mirror_depth(faults.mirror_depth(WALL)), WALL),
-        (faults.roll_depth(WALL, 0.25)[..., 16:], WALL[..., :48]),
+        (faults.apply_fault("rolled", WALL)[0][..., 6:], WALL[..., :58]),
         (faults.apply_fault("time", WALL, other=WALL * 1.1), (WALL * 1.1, KNOWN)),
     ):
         close(found, expected, atol=0)

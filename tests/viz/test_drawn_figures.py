@@ -104,7 +104,7 @@ def cases(folder):
         "sweep of a number": lambda: jobs.sweep_figure(swept),
         "sweep of names": lambda: jobs.sweep_figure(named),
         **{
-            f"report of {kind}": lambda kind=kind: figures.result_figures(getattr(archived, kind)())
+            f"report of {kind}": lambda kind=kind: figures.result_figures(archived.make(kind))
             for kind in ("range_split", "calibration", "motion", "latency", "hole_census")
         },
     }
