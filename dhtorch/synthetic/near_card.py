@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.records import Frame, Pose
 
@@ -60,10 +60,8 @@ def add_near_card(frame: Frame, T_world_from_card_view: Pose, seed: int) -> tupl
 
 def _card_in_view(camera: cam.Camera, hw: tuple[int, int], T_card_from_cam: Pose) -> tuple[Tensor, Tensor]:
     """Depth (B, h, w) of the card in a view, 0 beside it, and place on it (B, h, w, 2), -1 to 1."""
-    v, u = torch.meshgrid(*(torch.arange(n).to(camera.f) for n in hw), indexing="ij")
-    uv = torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1)
     T = T_card_from_cam.map(lambda x: x.to(camera.f))
-    ray = se3.rotate(T.R, cam.rays(camera, uv))
+    ray = se3.rotate(T.R, plane_sweep.pixel_rays(camera, hw).contiguous())
     normal = torch.tensor([-_CARD_SLOPE, 0.0, 1.0]).to(ray)
     centre = torch.tensor([*_CARD_CENTRE_M, CARD_DISTANCE_M]).to(ray)
     z = ((centre - T.t[:, None]) @ normal) / (ray @ normal)

@@ -25,7 +25,7 @@ from torch import Tensor
 from dhtorch import pytree
 from dhtorch.codes import Flag
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.geometry.patches import rescale_field_of_view, sample_nearest
 from dhtorch.pipeline import dense
@@ -104,10 +104,8 @@ def rot90_map(depth: Tensor, quarters: int) -> Tensor:
 
 def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
     """Lengths (B, h, w) of the viewing rays with z = 1 through a map's pixels: distance over depth. Gradient: none."""
-    v, u = torch.meshgrid(*(torch.arange(n, device=camera.f.device) for n in hw), indexing="ij")
-    uv = torch.stack((u, v), -1).view(1, -1, 2).expand(len(camera.f), -1, -1).to(camera.f)
     with torch.no_grad():
-        return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
+        return plane_sweep.pixel_rays(camera, hw).contiguous().norm(dim=-1).unflatten(1, hw)
 
 
 #: Hypothesis without a fault.

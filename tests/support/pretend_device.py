@@ -109,24 +109,21 @@ class PretendDevice(TorchDispatchMode):
             kwargs["device"] = torch.device("cpu")
         is_copy = func in _COPIES
         home = [x for x in leaves if not isinstance(x, OnDevice)]
-        if there and not is_copy and any(x.ndim for x in home) and not self._is_index(func, args, home):
+        # Indices at home are copied to the device.
+        is_index = func in _INDEXED and all(any(x is i for i in args[1]) for x in home)
+        if there and not is_copy and any(x.ndim for x in home) and not is_index:
             shapes = [(tuple(x.shape), x.device.type) for x in leaves]
             raise RuntimeError(f"{func}: expected all tensors on one device, found {shapes}")
         self._record(func, args, kwargs, there, wanted)
         result = func(*tree_map(_unwrap, args), **tree_map(_unwrap, kwargs))
-        if func is _aten._to_copy.default and wanted is not None:
-            there = wanted.type == DEVICE.type
-        elif func is _aten.copy_.default:
+        if func is _aten.copy_.default:
             return args[0]
-        elif wanted is not None:
+        if wanted is not None:
             there = wanted.type == DEVICE.type
         if not there:
             return result
-        return _wrap(result, args, kwargs, func)
-
-    def _is_index(self, func, args, home) -> bool:
-        """Whether all tensors at home are indices, which are copied to the device."""
-        return func in _INDEXED and all(any(x is i for i in args[1]) for x in home)
+        known = {id(x.held): x for x in tree_leaves((args, kwargs)) if isinstance(x, OnDevice)}
+        return tree_map(lambda x: known.get(id(x), OnDevice(x)) if isinstance(x, Tensor) else x, result)
 
     def _record(self, func, args, kwargs, there, wanted) -> None:
         kind = _WAITS.get(func) if there else None
@@ -155,23 +152,10 @@ def _unwrap(x):
     return x.held if isinstance(x, OnDevice) else x
 
 
-def _wrap(result, args, kwargs, func):
-    known = {id(x.held): x for x in tree_leaves((args, kwargs)) if isinstance(x, OnDevice)}
-
-    def wrap(x):
-        if not isinstance(x, Tensor):
-            return x
-        return known[id(x)] if id(x) in known else OnDevice(x)
-
-    return tree_map(wrap, result)
-
-
 def _where() -> str:
     """File and line of the package that called, innermost first."""
     for frame in reversed(traceback.extract_stack()):
-        if frame.filename.startswith(_PACKAGE) and "/pytree" not in frame.filename:
-            name = frame.filename[len(_PACKAGE) + 1 :]
-            if name.endswith("checks.py"):
-                continue
+        name = frame.filename.removeprefix(f"{_PACKAGE}/")
+        if name != frame.filename and "/pytree" not in frame.filename and not name.endswith("checks.py"):
             return f"{name}:{frame.name}:{frame.lineno}"
     return "elsewhere"

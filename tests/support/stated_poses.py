@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dhtorch.data.pose_convention import PoseConvention
@@ -23,26 +24,7 @@ DIRECTIONS = {
 
 def rotation(q: Tensor) -> Tensor:
     """Unit quaternions (B, 4), x y z w → rotations (B, 3, 3)."""
-    x, y, z, w = q.unbind(-1)
-    rows = [
-        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), -1),
-        torch.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)), -1),
-        torch.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)), -1),
-    ]
-    return torch.stack(rows, -2)
-
-
-def quaternion(R: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) → unit quaternions (B, 4), x y z w: the eigenvector of the largest eigenvalue."""
-    m = R.flatten(1).unbind(-1)
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = m
-    N = [
-        [xx - yy - zz, xy + yx, xz + zx, zy - yz],
-        [xy + yx, yy - xx - zz, yz + zy, xz - zx],
-        [xz + zx, yz + zy, zz - xx - yy, yx - xy],
-        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-    ]
-    return torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in N], -2)).eigenvectors[..., -1]
+    return torch.from_numpy(Rotation.from_quat(q.numpy()).as_matrix())
 
 
 def state_poses(true: Pose, convention: PoseConvention) -> Pose:
@@ -53,7 +35,7 @@ def state_poses(true: Pose, convention: PoseConvention) -> Pose:
     R, unit = stated.R, convention.unit
     if convention.quaternion is not None:
         order = {"wxyz": [3, 0, 1, 2], "xyzw": [1, 2, 3, 0]}[convention.quaternion]
-        R = rotation(quaternion(R)[:, order])
+        R = rotation(torch.from_numpy(Rotation.from_matrix(R.numpy()).as_quat())[:, order])
     return Pose(R, stated.t / (UNIT_METRES[unit] if isinstance(unit, str) else unit))
 
 
