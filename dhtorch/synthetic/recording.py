@@ -151,16 +151,18 @@ class SyntheticRoom(TruthRecording):
             ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACE_NAMES`.
         """
         i = self._position(index)
-        pose = self.true_poses[i : i + 1]
-        scene = self.world(i)
-        depth, solid = scene.solids.view(self.camera, pose, self.hw)
-        o, d = world_rays(self.camera, pose, self.hw)
-        face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
-        return {"depth": depth.view(1, *self.hw), "surface": scene.kind[face].to(torch.uint8).view(1, *self.hw)}
+        return self._true_view(i, self.camera, self.true_poses[i : i + 1], self.hw)
 
     def world(self, index: int) -> ShadedRoom:
         """The room at frame ``index``."""
         return furnished_room(self.seed)
+
+    def _true_view(self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
+        scene = self.world(i)
+        depth, solid = scene.solids.view(camera, pose, hw)
+        o, d = world_rays(camera, pose, hw)
+        face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
+        return {"depth": depth.view(1, *hw), "surface": scene.kind[face].to(torch.uint8).view(1, *hw)}
 
     def _render(self, i: int) -> Frame:
         pose, poses, times = self.true_poses[i : i + 1], self.poses, self.times

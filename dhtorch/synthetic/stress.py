@@ -100,7 +100,13 @@ class StressRoom(SyntheticRoom):
         self.turn = STRESSES[stress].turn
         if self.turn is not None:
             n_frames, rate_hz = options.get("n_frames", 12), options.get("rate_hz", 30.0)
-            self._pose_at = partial(self.turn.poses, duration_s=n_frames / rate_hz, seed=options.get("seed", 2))
+            self._pose_at = partial(
+                turn_by_hand,
+                duration_s=n_frames / rate_hz,
+                degrees=self.turn.degrees,
+                reach_m=self.turn.reach_m,
+                seed=options.get("seed", 2),
+            )
             options["true_poses"] = self._pose_at([i / rate_hz for i in range(n_frames)])
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
@@ -362,10 +368,6 @@ class HandTurn(NamedTuple):
     reach_m: float
     readout_s: float = 0.02  # of the rolling shutter, from the first row to the last
     near: float = 1.3  # m, cutoff at which near returns lie on the parcels
-
-    def poses(self, times: Sequence[float], *, duration_s: float, seed: int) -> Pose:
-        """``T_world_from_cam`` (n) at times in s, in a recording of ``duration_s``."""
-        return turn_by_hand(times, duration_s=duration_s, degrees=self.degrees, reach_m=self.reach_m, seed=seed)
 
 
 class Stress(NamedTuple):

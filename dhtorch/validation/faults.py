@@ -395,20 +395,14 @@ class FaultWindow:
         """
         if self.maps is None:
             return True
-        before, after = (self.loss(fault, near=True) for fault in (NO_FAULT, cause))
-        sensor_loss = self.loss(NO_FAULT, near=True, sensor=True, focal=cause.focal)
+        before, after = (self.sample_losses(fault, near=True).mean() for fault in (NO_FAULT, cause))
+        sensor_loss = self.sample_losses(NO_FAULT, near=True, sensor=True, focal=cause.focal).mean()
         valid = before.isfinite() & after.isfinite() & sensor_loss.isfinite()
         if int(valid.sum()) < self.options.min_window_pairs:
             return True
         return float((before - after)[valid].mean()) >= self.options.min_explained_ratio * float(
             (before - sensor_loss)[valid].mean()
         )
-
-    def loss(
-        self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
-    ) -> Tensor:
-        """(P,) mean loss with that fault undone; NaN where a pair has none. Arguments as :meth:`sample_losses`."""
-        return self.sample_losses(cause, near=near, sensor=sensor, focal=focal).mean()
 
     def comparable_loss(self, cause: KnownFault, base: SampleLosses) -> Tensor:
         """(P,) loss with that fault undone, comparable with the loss ``base`` without a fault; NaN without one.
@@ -421,7 +415,7 @@ class FaultWindow:
         if cause == NO_FAULT:
             return base.mean()
         if self.maps is not None:
-            return self.loss(cause)
+            return self.sample_losses(cause).mean()
         losses = self.sample_losses(cause)
         both = base.used & losses.used
         return base.mean() + replace(losses, used=both).mean() - replace(base, used=both).mean()

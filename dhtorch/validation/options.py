@@ -164,11 +164,6 @@ class ValidationOptions:
     #: Least fraction of the textured samples that a pair must track.
     min_tracked_ratio: float = 0.4
 
-    @property
-    def share_window_pixels(self) -> int:
-        """Grid pixels that count as one independent pixel in the wrong fraction: a correlation window."""
-        return (2 * self.evidence_radius_px + 1) ** 2
-
 
 #: The default of every function that takes options.
 DEFAULT_VALIDATION_OPTIONS: Final = ValidationOptions()

@@ -197,9 +197,8 @@ def validate_against(
     clip_depth, at_clip_depth = clipped_depth(grid, *combined[:2], options)
     is_flying, at_outline, state, misfit, view = _refute_outlines(combined, flying, outlines, agrees, options)
     state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
-    n_wrong, n_known = (
-        (m.sum((1, 2)) / options.share_window_pixels) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
-    )
+    window = (2 * options.evidence_radius_px + 1) ** 2  # its pixels count as one independent pixel
+    n_wrong, n_known = (m.sum((1, 2)) / window for m in (state == State.WRONG, state != State.CANNOT_KNOW))
     point_depth = evidence.triangulated_depth(grid, reference.hw, points, options)
     no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
     by_trajectory = no_scale if selected is None else _scale_vs_trajectory(reference, selected, options)
