@@ -251,23 +251,23 @@ def _one_standard_error_choice(
     3. Far answers must support a drift: what near returns alone require in their part of the picture is no evidence for
        the far part.
     """
-    blocks = _block_losses(points, held_out, options)
-    n = blocks.mean.shape[1]
-    far_mass = blocks.mass * (torch.arange(blocks.mass.shape[-1], device=blocks.mass.device) % 2 == 0)
-    far_loss = (far_mass * blocks.mean).sum(-1)
+    loss, mass, near_error = _block_losses(points, held_out, options)
+    n = loss.shape[1]
+    far_mass = mass * (torch.arange(mass.shape[-1], device=mass.device) % 2 == 0)
+    far_loss = (far_mass * loss).sum(-1)
     candidate = torch.arange(n, device=far_loss.device)
     simpler_limit = torch.cat(((candidate[:-1] - 1).expand(len(far_loss), -1), head[:, None]), -1).clamp_min(0)
     simpler = far_loss.cummin(-1).indices.gather(1, simpler_limit)
-    increase, error = _loss_difference(blocks.mean, simpler, far_mass)
+    increase, error = _loss_difference(loss, simpler, far_mass)
     enough_far = (points.used & ~points.near).sum(-1, keepdim=True) >= options.min_references
     has_shift = torch.tensor([*(MODEL_HEADS[name].shift for name in heads), False], device=far_loss.device)
     shift_refuted = has_shift & (
-        increase > torch.where(blocks.near_error <= options.exact_fit_error, options.veto_standard_errors, 1.0) * error
+        increase > torch.where(near_error <= options.exact_fit_error, options.veto_standard_errors, 1.0) * error
     )
     drift_refuted = (candidate == n - 1) & (increase >= 0)
     rejected = enough_far & (shift_refuted | drift_refuted)
-    mean = (blocks.mass * blocks.mean).sum(-1).masked_fill(rejected, torch.inf)
-    excess, error = _loss_difference(blocks.mean, mean.argmin(-1, keepdim=True).expand(-1, n), blocks.mass)
+    mean = (mass * loss).sum(-1).masked_fill(rejected, torch.inf)
+    excess, error = _loss_difference(loss, mean.argmin(-1, keepdim=True).expand(-1, n), mass)
     good = (excess <= error.clamp_min(options.loss_rounding)) & mean.isfinite()
     return good.to(torch.int8).argmax(-1)
 
@@ -282,16 +282,13 @@ def _loss_difference(loss: Tensor, other: Tensor, mass: Tensor) -> tuple[Tensor,
     return mean[..., 0], error
 
 
-class _BlockLosses(NamedTuple):
-    """Losses of models in blocks of the picture; near and far references of one part form two blocks."""
+def _block_losses(
+    points: MetricReferences, held_out: _HeldOut, options: AlignmentOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of left-out references -> losses of models in blocks of the image (B, C, blocks), weights of the blocks
+    (B, 1, blocks), and the median relative error of near returns (B, C).
 
-    mean: Tensor  # (B, C, blocks)
-    mass: Tensor  # (B, 1, blocks) weight of a block; correlated references of one block count as fewer
-    near_error: Tensor  # (B, C) median relative error of near returns
-
-
-def _block_losses(points: MetricReferences, held_out: _HeldOut, options: AlignmentOptions) -> _BlockLosses:
-    """Residuals of left-out references -> loss per model and block.
+    Near and far references of one part form two blocks; correlated references of one block count as fewer.
 
     The loss of a reference is the logarithm of its residual relative to its own error: the stated one for far answers;
     for near returns the least median residual of any model, since returns are often better than they state. A core that
@@ -309,7 +306,7 @@ def _block_losses(points: MetricReferences, held_out: _HeldOut, options: Alignme
     count = total[:, :1].scatter_add(2, block, valid.to(loss))
     mean = total.scatter_add(2, block.expand_as(loss), torch.where(valid, loss, 0.0)) / count.clamp_min(1)
     mass = count / (1 + options.block_correlation * (count - 1).clamp_min(0))
-    return _BlockLosses(mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9), near_error.nan_to_num(torch.inf))
+    return mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9), near_error.nan_to_num(torch.inf)
 
 
 # ---------------------------------------------------------------------------------------------------------- every pixel
