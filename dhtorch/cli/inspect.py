@@ -37,8 +37,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal.formats import survey_stacks
-from dhtorch.experiments.focal.image_folder import list_camera_files
+from dhtorch.experiments.focal.formats import list_camera_files, survey_stacks
 from dhtorch.geometry.sensor_noise import sensor_of_format
 from dhtorch.pipeline.picture_matching import spread_evenly
 from dhtorch.runtime import safe_open as doors

@@ -12,8 +12,18 @@ import torch
 
 from dhtorch.codes import Cause, Source, is_estimated
 from dhtorch.data.scene import Scene, SceneLike
-from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Answer, Method, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Answer,
+    Method,
+    Progress,
+    Protocol,
+    Row,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
@@ -48,7 +58,7 @@ def make_exhibit(
     *,
     most: int = 12,
     sweep: DenseSweep | None = None,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Exhibit:
     """Run a method on pairs of a recording, as the main job does → exhibit of its images, samples and point clouds.
 
@@ -69,7 +79,7 @@ def make_exhibit(
     pair_exhibits: list[PairExhibit] = []
     views: dict[int, ExhibitView] = {}
 
-    def keep(answer: Answer) -> protocol.Row:
+    def keep(answer: Answer) -> Row:
         batch = answer.batch
         for k, frame in ((batch.pairs[0][0], batch.reference), answer.other):
             if k not in views:
@@ -85,7 +95,7 @@ def make_exhibit(
         return [found[k] for k in sorted({round(i * last / max(n - 1, 1)) for i in range(n)})]
 
     viewer_protocol = Protocol({"view": Variant(method, estimate=sweep, chooses=True)}, columns=keep, min_candidates=0)
-    protocol.run([shown_scene], viewer_protocol, choose, settings, progress=progress)
+    run_protocol([shown_scene], viewer_protocol, choose, settings, progress=progress)
     path = None if recording.poses is None else recording.poses.t.detach().cpu().numpy()
     return Exhibit(recording.name, pair_exhibits, list(views.values()), path)
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import io
 import pickle
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,13 @@ class FinishedScenes:
             return outcome
 
         return keep
+
+    def run(self, scenes: Iterable[Any], evaluate: Callable[[Any], Outcome], **options: Any) -> Outcome:
+        """Outcome of a loop that evaluates scene after scene, with these options of the record."""
+        outcome, keep = Outcome(**options), self.loop()
+        for scene in scenes:
+            outcome.add(keep(scene.name, partial(evaluate, scene)))
+        return outcome
 
     def remove(self) -> None:
         """Remove all scenes: the result is written."""

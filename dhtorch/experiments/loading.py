@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,13 +83,9 @@ def _make_loader(
     )
 
 
-class FrameChunk(NamedTuple):
-    """Frames of one recording that go through one forward pass: rows of positions, such as (frame, second view)."""
-
-    recording: Recording
-    rows: Sequence[tuple[int, ...]]
-    truth: bool = False  # also the true depth of the first frame of each row; the recording is a TruthRecording
-
+#: Frames of one recording that go through one forward pass: rows of positions, such as (frame, second view), and
+#: whether also the true depth of the first frame of each row, of a TruthRecording.
+FrameChunk = tuple[Recording, Sequence[tuple[int, ...]], bool]
 
 #: Rows of frames, and by row the true depth (1, H, W) of its first frame, empty without truth.
 LoadedChunk = tuple[list[tuple[Frame, ...]], list[Tensor]]
@@ -114,35 +109,10 @@ class ChunkDataset(Dataset[LoadedChunk]):
         return [tuple(frames[k] for k in row) for row in rows], truth
 
 
-class ChunkReader:
-    """Reads groups of chunks in order, in ``workers`` processes that start once for all of them (0: in this process).
-
-    Args:
-        groups: number of a group, such as those of one shard of features -> its chunks; in the order of reading.
-        dtype: of the frames.
-        workers: number of processes.
-    """
-
-    def __init__(self, groups: Mapping[int, Sequence[FrameChunk]], dtype: torch.dtype, workers: int) -> None:
-        ends = itertools.accumulate(map(len, groups.values()))
-        self._spans = {k: (end - len(groups[k]), end) for k, end in zip(groups, ends, strict=True)}
-        data = ChunkDataset([chunk for chunks in groups.values() for chunk in chunks], dtype)
-        self._loader = iter(_make_loader(data, _unchanged, batch=None, workers=min(workers, len(data))))
-        self._n_read = 0
-
-    def length(self, group: int) -> int:
-        """Number of chunks of a group."""
-        start, end = self._spans[group]
-        return end - start
-
-    def read(self, group: int) -> Iterator[LoadedChunk]:
-        """Chunks of a group; those of earlier groups that were not read are skipped."""
-        start, end = self._spans[group]
-        while self._n_read < end:
-            chunk = next(self._loader)
-            self._n_read += 1
-            if self._n_read > start:
-                yield chunk
+def read_chunks(chunks: Sequence[FrameChunk], dtype: torch.dtype, workers: int) -> Iterator[LoadedChunk]:
+    """Read chunks in order, in ``workers`` processes that start once for all of them (0: in this process)."""
+    data = ChunkDataset(chunks, dtype)
+    return iter(_make_loader(data, _unchanged, batch=None, workers=min(workers, len(data))))
 
 
 def _unchanged(item: Any) -> Any:

@@ -8,8 +8,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_progress,
+    run_protocol,
+)
 
 
 def run(
@@ -18,11 +27,11 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Run every method on every pair of every recording, for every truth test of ``settings``.
 
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; ``methods`` is name → method.
     """
     variants = {name: Variant(method) for name, method in methods.items()}
-    return protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    return run_protocol(scenes, Protocol(variants), pairs, settings, progress=progress)

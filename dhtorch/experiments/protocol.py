@@ -97,9 +97,8 @@ class SharedTracks:
 
 def _is_same_tensor(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors share memory or have equal values (selected views are copies)."""
-    if a.shape != b.shape or a.dtype != b.dtype:
-        return False
-    return (a.data_ptr() == b.data_ptr() and a.stride() == b.stride()) or torch.equal(a, b)
+    is_same_memory = a.data_ptr() == b.data_ptr() and a.stride() == b.stride()
+    return a.shape == b.shape and a.dtype == b.dtype and (is_same_memory or torch.equal(a, b))
 
 
 def stage_key(fn: Any) -> Any:
@@ -299,11 +298,6 @@ def spread_pairs(pairs: ScenePairs, references: int | None, scene: Scene) -> lis
     return [fixed[(2 * k + 1) * len(fixed) // (2 * references)] for k in range(references)]
 
 
-def no_columns(_answer: Answer) -> Row:
-    """Default of :attr:`Protocol.columns`: no further columns."""
-    return {}
-
-
 @dataclass(frozen=True)
 class Protocol:
     """Variants to run, the input they see, the cohorts that are evaluated, and further columns of each pair."""
@@ -313,7 +307,9 @@ class Protocol:
         default_factory=dict
     )  # the last one selects the pairs; none = those of the range split, by the truth tests of the settings
     hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → the view as a method sees it
-    columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers enter the scene's row as medians over pairs
+    columns: Callable[[Answer], Row] = (
+        lambda _answer: {}
+    )  # of one pair; numbers enter the scene's row as medians over pairs
     min_candidates: int = MIN_CANDIDATES
     reads_scores: bool = False  # the score of every method is evaluated as a probability, also one that only orders
 
@@ -334,25 +330,8 @@ class Protocol:
             return settings.between
         return max((images_used(v.method.track) for v in self.variants.values() if v.offers is None), default=0)
 
-    def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
-        """Pairs per call: one where the number of candidate views or of frames between may differ."""
-        most = self.between(settings)
-        n_between = {len(frames_between(i, j, most)) for i, j in pairs if isinstance(j, int)}
-        same = self.offers is None and not any(pair.candidates for pair in pairs) and len(n_between) <= 1
-        return settings.batch if same else 1
 
-    def allows(self, pairs: Sequence[Pair]) -> None:
-        """Check that pairs have a fixed source view if a variant cannot select views.
-
-        Raises:
-            ValueError: pairs with candidate views for such a variant.
-        """
-        for v in self.variants.values():
-            if v.two_frames or v.fit is not None or (v.estimate is not None and not v.chooses):
-                to_fixed_pairs(pairs)
-
-
-def run(
+def run_protocol(
     scenes: Sequence[SceneLike],
     protocol: Protocol,
     pairs: ScenePairs,
@@ -385,14 +364,23 @@ def run(
     return outcome
 
 
+#: The same under the name that every experiment's function has.
+run = run_protocol
+
+
 def _run_scene(scene: Scene, protocol: Protocol, pairs: ScenePairs, settings: Settings, progress: Progress) -> Outcome:
     """Rows, example and points of one scene."""
     chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
-    protocol.allows(chosen)
+    for v in protocol.variants.values():
+        if v.two_frames or v.fit is not None or (v.estimate is not None and not v.chooses):
+            to_fixed_pairs(chosen)  # raises for pairs with candidate views, which the variant cannot select from
     collector = _SceneCollector(scene, protocol, settings)
     views, between = protocol.views(chosen), protocol.between(settings)
     data = PairDataset(scene.recording, chosen, settings.dtype, views, protocol.offers, between)
-    size = protocol.batch(settings, chosen)
+    # one pair per call where the number of candidate views or of frames between may differ
+    n_between = {len(frames_between(i, j, between)) for i, j in chosen if isinstance(j, int)}
+    same = protocol.offers is None and not any(pair.candidates for pair in chosen) and len(n_between) <= 1
+    size = settings.batch if same else 1
     loader = load_pairs(data, batch=size, workers=settings.workers)
     for start, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
         on_device = move_to_device(tuple(items), settings.device)
@@ -425,11 +413,17 @@ class _SceneCollector:
         """Run all variants on one batch of pairs."""
         reference = self.protocol.hide(batch.reference, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
-        candidates = self._candidate_frames(batch)
+        offered = candidate_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
+        candidates = {k: self.protocol.hide(v, self.cutoff) for k, v in zip(offered, batch.around, strict=True)}
         inputs: dict[Any, Frame | None] = {}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            view_key, frames = self._source_views(variant, batch, views, candidates)
+            if variant.offers is None and views:
+                view_key: Any = variant.method.views
+                frames = list(views[-variant.method.views :])
+            else:
+                view_key = tuple(candidate_views(batch.pairs[0], self.scene.recording, variant.offers))
+                frames = [candidates[j] for j in view_key]
             if view_key not in inputs:  # one record for all variants with equal input, so that they share tracks
                 inputs[view_key] = pytree.stack(frames) if len(frames) > 1 else next(iter(frames), None)
             others = inputs[view_key]
@@ -453,7 +447,10 @@ class _SceneCollector:
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
-                self._count_holes(variant.method, batch.reference, answer.samples.uv)
+                # fractions of the kinds of holes of the sensor, before any return is held back
+                for hole in variant.method.sample_depth_at(batch.reference, answer.samples.uv).hole:
+                    total = max(int((hole != Hole.NONE).sum()), 1)
+                    self.census.append({code: float((hole == code).sum()) / total for code in names(Hole)})
                 enough = [int(ok.sum()) >= self.fewest_candidates for ok in truths[self.deciding_cohort].ok]
                 self.n_few += enough.count(False)
             reports = []
@@ -514,20 +511,6 @@ class _SceneCollector:
                 rows.append(row)
         return rows
 
-    def _candidate_frames(self, batch: Batch) -> dict[int, Frame]:
-        """Candidate views of all variants, after hiding: position → frame."""
-        positions = candidate_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
-        return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
-
-    def _source_views(
-        self, variant: Variant, batch: Batch, views: Sequence[Frame], offered: Mapping[int, Frame]
-    ) -> tuple[Any, list[Frame]]:
-        """(key, source views) of one variant; variants with an equal key have equal source views."""
-        if variant.offers is None and views:
-            return variant.method.views, list(views[-variant.method.views :])
-        positions = tuple(candidate_views(batch.pairs[0], self.scene.recording, variant.offers))
-        return positions, [offered[k] for k in positions]
-
     def _hint(self, batch: Batch, others: Frame | None) -> TrackHint:
         """The scene's hint, with the images between the reference view and its only source view."""
         if not batch.between or others is None or others.image.dim() != 4:
@@ -537,16 +520,10 @@ class _SceneCollector:
     def _selection_report(self, answer: Answer) -> ViewReport | None:
         """Report of the view selection of one answer; None for a variant without candidate views."""
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
-        offered = candidate_views(pair, self.scene.recording, offers)
-        if not offered:  # unanswered: the variant needs candidate views and there are none
-            return None if offers is None else ViewReport(pair.reference, (), 0)
-        return report_selection(pair.reference, offered, answer.trace)
-
-    def _count_holes(self, method: Method, reference: Frame, uv: Tensor) -> None:
-        """Add the fraction of each kind of hole of the sensor, before any return is held back."""
-        for hole in method.sample_depth_at(reference, uv).hole:
-            total = max(int((hole != Hole.NONE).sum()), 1)
-            self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
+        if offered := candidate_views(pair, self.scene.recording, offers):
+            return report_selection(pair.reference, offered, answer.trace)
+        # unanswered: the variant needs candidate views and there are none
+        return None if offers is None else ViewReport(pair.reference, (), 0)
 
     def _add_pair(self, answer: Answer, report: ViewReport | None) -> None:
         """Add the rows and points of one pair."""
@@ -557,8 +534,10 @@ class _SceneCollector:
         gate_ratio = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
         pair = [answer.batch.pairs[0].reference, answer.other[0]]
         identity: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
-        columns: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
-        columns |= {
+        columns: Row = {
+            "pnp_ok": bool(fit.ok[0]),
+            "n_inlier": int(fit.n_inlier[0]),
+            "n_holes": int(hole.sum()),
             "n_recovered": int((estimate.keep & hole).sum()),
             "gate_share": gate_ratio,
             "ms": answer.trace["ms"],
@@ -571,8 +550,13 @@ class _SceneCollector:
             self.dropped.setdefault((answer.variant, cohort), []).append(truth.dropped())
             counted = {"n_real_holes": truth.n_real_holes, **errors.measure_errors(points)}
             self.pair_rows.append({**identity, "truth": cohort, **columns, **counted, **extra})
+            excluded, candidate = holdout.TruthCode.EXCLUDED, holdout.TruthCode.CANDIDATE
             for code, kind in answer.batch.odd.items() if kinds is not None else ():
-                on_kind = truth.replace(code=_reopen_kind(truth, kinds, code))
+                # the excluded samples on this kind of surface as candidates, and all others excluded
+                reopened = torch.where(truth.code == excluded, candidate, truth.code)
+                on_kind = truth.replace(
+                    code=torch.where(torch.as_tensor(kinds == code), reopened, torch.full_like(reopened, excluded))
+                )
                 self.separate_points.setdefault((answer.variant, cohort, kind), []).append(
                     errors.points_from_estimate(estimate, on_kind)
                 )
@@ -592,14 +576,6 @@ def _track_nothing(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: Trac
 
 def _has_cutoff(cutoff: float | None) -> bool:
     return cutoff is not None and cutoff != math.inf
-
-
-def _reopen_kind(truth: holdout.Truth, kinds: Tensor | None, kind: int) -> Tensor:
-    """Truth codes with the EXCLUDED samples on one kind of surface as candidates, and all others EXCLUDED."""
-    if kinds is None:
-        return truth.code
-    code = torch.where(truth.code == holdout.TruthCode.EXCLUDED, holdout.TruthCode.CANDIDATE, truth.code)
-    return torch.where(kinds == kind, code, torch.full_like(code, holdout.TruthCode.EXCLUDED))
 
 
 #: A pair of frames, or a frame alone as (i, i).
@@ -660,10 +636,7 @@ def screen_scenes(
         part.n_pairs = len(chosen)
         return part
 
-    outcome = Outcome(metrics=metrics)
-    keep = finished.loop()
-    for scene in scenes:
-        outcome.add(keep(scene.name, partial(screen, scene)))
+    outcome = finished.run(scenes, screen, metrics=metrics)
     outcome.summary = summarise_rows(outcome.rows, variants, [truth])
     return outcome
 

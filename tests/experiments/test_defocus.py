@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from dhtorch.experiments.focal import defocus as experiment
 from dhtorch.experiments.focal.blur import (
     BlurMap,
     estimate_blur,
@@ -13,13 +12,11 @@ from dhtorch.experiments.focal.blur import (
     guess_side_by_height,
     inverse_depth_from_blur,
 )
-from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry.filters import gaussian_blur
-from dhtorch.geometry.thin_lens import depth_of_spot, spot_diameter, spot_gain
+from dhtorch.geometry.thin_lens import spot_diameter
 from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
-from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
 def edge(angle_deg=0.0, contrast=0.8):
@@ -51,22 +48,6 @@ def test_noise_is_taken_off():
     assert float(blind) < float(found), "noise that is not taken off reads as sharpness"
     flat = 0.5 + 4 / 255 * torch.randn(1, 1, 96, 160, generator=draw)
     assert float(estimate_blur(flat, noise=4 / 255).valid.float().mean()) == 0
-
-
-def test_the_spot_follows_the_thin_lens():
-    lens = make_lens(500.0, focal_length_m=0.05, f_number=2.0)
-    near, far = 1.0, 4.0
-    spot = spot_diameter(lens, torch.tensor([[near, 2.0, far, 0.0]]), torch.tensor([2.0]))[0]
-    # From the lens equation itself: images at v(z), the sensor at v(2), similar triangles behind the aperture.
-    v = {z: 1 / (1 / 0.05 - 1 / z) for z in (near, 2.0, far)}
-    for k, z in ((0, near), (2, far)):
-        want = 0.025 * abs(v[2.0] - v[z]) / v[z] / (0.05 / 500)
-        assert abs(float(spot[k])) == pytest.approx(want, rel=1e-4)
-    assert float(spot[0]) < 0 < float(spot[2]) and float(spot[1]) == 0 and bool(spot[3].isnan())
-    back = depth_of_spot(lens, spot[None, :3], torch.tensor([2.0]))[0]
-    torch.testing.assert_close(back, torch.tensor([near, 2.0, far]), rtol=1e-5, atol=0)
-    beyond = 1.01 * spot_gain(lens, torch.tensor([[2.0]])) / 2
-    assert bool(depth_of_spot(lens, beyond, torch.tensor([2.0])).isnan().all()), "no spot is larger than infinity's"
 
 
 def test_a_point_becomes_a_disc_of_its_diameter():
@@ -130,13 +111,6 @@ def test_inverse_depth_needs_the_side():
     assert bool(inverse_depth_from_blur(silent, torch.ones(1, 2, 1), lens, focus).isnan().all())
 
 
-def test_the_two_ambiguities():
-    found = experiment.measure_ambiguities(noise=1 / 255)
-    assert found["blank_wall.sharp_paint_px"] < 0.3 < found["blank_wall.soft_paint_px"], "soft paint looks defocused"
-    assert found["blank_wall.plain_share"] == 0, "a plain wall says nothing"
-    assert found["two_sides.ratio"] == pytest.approx(1, rel=0.1), "near and far of the focus look alike"
-
-
 def test_sides():
     sigma = torch.full((1, 40, 30), 3.0)
     sigma[:, 25:28] = 0.2
@@ -147,15 +121,3 @@ def test_sides():
         float(guess_side_by_colour(red_sharp)[0, 48, 80]) == 1
         and float(guess_side_by_colour(red_sharp.flip(1))[0, 48, 80]) == -1
     )
-
-
-@pytest.mark.slow
-def test_a_run_and_its_rows():
-    views = open_viewpoints(1, hw=(120, 160))
-    outcome = experiment.run(views, {}, None, Settings(), axial_colour_dpt=0.5)
-    rows = outcome.scenes("oracle_side")
-    assert set(rows) == {"viewpoint_00"} and outcome.verdict in ("supported", "refuted")
-    row = rows["viewpoint_00"]
-    assert row["side_right"] == 1 and row["n_kept"] > 50 and -1 <= row["corr"] <= 1
-    assert outcome.scenes("by_colour")["viewpoint_00"]["side_right"] > 0.5, "better than a guess"
-    assert "two_sides.ratio" in outcome.summary

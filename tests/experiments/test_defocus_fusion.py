@@ -6,8 +6,6 @@ import torch
 from dhtorch.experiments.focal import defocus_fusion as experiment
 from dhtorch.experiments.focal.blur import BlurMap
 from dhtorch.experiments.focal.filling import fill_bilinear, fill_defocus_guided, fill_guided, fill_joint_bilateral
-from dhtorch.experiments.protocol import Settings
-from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
 def plane(h=70, w=84):
@@ -58,14 +56,3 @@ def test_exact_defocus_corrects_an_edge_and_useless_defocus_changes_little():
     assert float((useless - whole).abs().mean()) < 1.05 * float(before)
     nothing = fill_defocus_guided(plain, coarse, exact.replace(valid=~everywhere))
     assert torch.equal(nothing, plain)
-
-
-def test_a_run_and_its_rows():
-    outcome = experiment.run(open_viewpoints(1, hw=(120, 160)), {}, None, Settings())
-    rows = {r["method"]: r for r in outcome.rows if r["pair"] is None}
-    assert set(rows) == set(experiment.VARIANTS) and outcome.verdict in ("supported", "refuted")
-    assert len({r["n_candidates"] for r in rows.values()}) == 1, "all are judged on the same pixels"
-    assert rows["bilinear"]["changed_rel"] == 0 and rows["bilinear"]["corr"] > 0.8
-    assert outcome.summary["defocus_guided.mean_rel_ratio"]["value"] == pytest.approx(
-        rows["defocus_guided"]["mean_rel"] / rows["bilinear"]["mean_rel"]
-    )

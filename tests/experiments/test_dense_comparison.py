@@ -5,12 +5,10 @@ import torch
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, Source
-from dhtorch.data.pairs import by_gap
-from dhtorch.data.scene import Scene
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments.baselines import stereo
 from dhtorch.experiments.compare import dense_comparison
-from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.experiments.protocol import Outcome
 from dhtorch.geometry import se3
 from dhtorch.metrics import errors
 from dhtorch.metrics.holdout import range_split
@@ -20,29 +18,11 @@ from dhtorch.synthetic import SyntheticRoom
 
 NEAR = 2.0
 METHOD = MAP.replace(n=768)
-SWEEP = {"planes": 32, "source_views": 2, "size": 160}
 
 
 @pytest.fixture(scope="module")
 def room():
     return SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(120, 160), lidar="exact", image_noise=0.0, name="hall")
-
-
-@pytest.fixture(scope="module")
-def outcome(room):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stereo, "_N_ROUNDS", 3)
-        return dense_comparison.run(
-            [Scene(room, near=NEAR, gap=8)],
-            {"map": METHOD},
-            by_gap,
-            Settings(),
-            sweep=SWEEP,
-            stride=1,
-            reference_views=1,
-            indoor=["hall"],
-            rooms=(),
-        )
 
 
 @pytest.fixture(scope="module")
@@ -57,31 +37,6 @@ def pair(room):
         grid,
         reference,
     )
-
-
-@pytest.mark.slow
-def test_every_variant_is_judged_where_it_belongs(outcome):
-    rows = {name: outcome.scenes(name)["hall"] for name in ("sparse", "dense, at samples", "dense", "sgbm", "dis flow")}
-    assert rows["sparse"]["n_candidates"] == rows["dense, at samples"]["n_candidates"]
-    assert rows["dense"]["n_candidates"] == rows["sgbm"]["n_candidates"] > 5 * rows["sparse"]["n_candidates"]
-    assert rows["dense"]["n_dropped"]["texture"] == 0
-    assert "note" in outcome.scenes("sgbm, own calibration")["hall"], "the room is no rectified pair"
-    assert rows["dense"]["ms"].keys() >= {"sparse", "sweep_2", "sweep_1"}
-
-
-@pytest.mark.slow
-def test_the_summary_is_what_its_points_say(outcome):
-    points = {k[1]: p for k, p in outcome.points.items() if k[0] == "hall" and k[2] == "full"}
-    both = points["sparse"].keep & points["dense, at samples"].keep
-    a, b = (float(points[name].error[both].median()) for name in ("dense, at samples", "sparse"))
-    assert outcome.summary["dense.error_ratio_to_sparse"]["value"] == pytest.approx(a / b)
-    share = float(points["dense"].keep.double().mean())
-    assert outcome.summary["dense.answered"]["value"] == pytest.approx(share) and share > 0.3
-    wrong = float((points["dense"].answered().error > 0.2).double().mean())
-    assert outcome.summary["dense.wrong_share"]["value"] == pytest.approx(wrong)
-    indoor = outcome.summary["sparse.coverage_at_5_indoor"]
-    assert indoor["value"] == outcome.scenes("sparse")["hall"]["coverage_at_5"] and indoor["n"] == 1
-    assert outcome.summary["dense.error_ratio_to_sgbm"]["n"] <= 1 and outcome.summary["dense.ause_ratio"]["value"] < 1
 
 
 def test_a_turn_is_counted_by_its_holes():

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from dhtorch.data import FormatError
 from dhtorch.experiments.baselines import dinov2
 from dhtorch.experiments.baselines.dinov2 import dinov2_from_onnx, read_dinov2_weights
-from dhtorch.experiments.probes.front_ends import PatchTokens, load_visual_front_end
+from dhtorch.experiments.probes.front_ends import load_network_front_ends, patch_tokens
 from dhtorch.synthetic.recording import SyntheticRoom
 
 WIDTH, PATCH, SIDE, LAYERS, HEADS = 128, 14, 56, 2, 2
@@ -93,7 +93,7 @@ def test_an_official_file_is_the_network_that_it_describes(tmp_path, picture, op
     torch.testing.assert_close(half, forward(state, picture, layers=1), atol=2e-5, rtol=1e-4)
     assert dinov2.register_count(network) == options.get("registers", 0)
     room = SyntheticRoom(hw=(60, 80), n_frames=1)[0]
-    features = PatchTokens(network, cells=2, side=SIDE)([room])
+    features = patch_tokens(network, [room], cells=2, side=SIDE)
     tokens = forward(state, dinov2.preprocess_image(room.image, SIDE))[0, 1 + options.get("registers", 0) :]
     corner = tokens.unflatten(0, (4, 4))[:2, :2].mean((0, 1))
     torch.testing.assert_close(features[0, WIDTH:].view(WIDTH, 2, 2)[:, 0, 0], corner, atol=2e-5, rtol=1e-4)
@@ -144,8 +144,8 @@ def test_other_layouts_of_the_same_parameters(tmp_path, picture):
             found = dinov2.load_dinov2(path)(pixel_values=picture).last_hidden_state
         torch.testing.assert_close(found, forward(parameters, picture), atol=2e-5, rtol=1e-4)
     assert "head of its own" in dinov2_from_onnx(onnx).origin
-    front, origin = load_visual_front_end(lambda: network, cells=1, device="cpu")
-    assert origin is None and front is not None, "without a stated file the weights count as random"
+    front, origin = load_network_front_ends(lambda: network, cells=1, device="cpu")
+    assert origin is None and list(front) == ["dinov2"], "without a stated file the weights count as random"
 
 
 WHOLE = official()

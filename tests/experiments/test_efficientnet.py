@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -63,7 +64,7 @@ def test_the_network_is_the_published_one():
     found = efficientnet.EfficientNetLite(state)(image)
     assert found.shape == (2, 320, 3, 2)
     torch.testing.assert_close(found, x, atol=1e-4, rtol=1e-4)
-    features = efficientnet.MapFeatures(efficientnet.EfficientNetLite(state), cells=2)
+    features = partial(efficientnet.map_features, efficientnet.EfficientNetLite(state), cells=2)
     frame = SyntheticRoom(hw=(60, 80), n_frames=1)[0]
     assert features([frame, frame]).shape == (2, 1280) and features([frame]).std() > 0
 

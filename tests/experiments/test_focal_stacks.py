@@ -21,7 +21,7 @@ from dhtorch import data
 from dhtorch.cli import run
 from dhtorch.data import FormatError
 from dhtorch.data.codecs import tiff
-from dhtorch.experiments.focal import fod500, formats
+from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.ddff12 import refocus
 from dhtorch.experiments.focal.stacks import FocalStacks
 
@@ -58,7 +58,7 @@ def test_fod500_gives_back_pictures_depth_and_lens(tmp_path: Path, monkeypatch: 
     tifffile.imwrite(tmp_path / "b/000000_00All.tif", image, compression="lzw", predictor=True, photometric="rgb")
     got = formats.open_stacks(tmp_path / "b")[0]
     assert bool((got.depth == 1.5).all()) and torch.equal(got.images[0, 0], random_stack(3).images[0, 0])
-    for module, name in ((tiff, "read_tiff"), (fod500.exr, "read_exr")):
+    for module, name in ((tiff, "read_tiff"), (formats.exr, "read_exr")):
         monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
     assert len(formats.open_stacks(tmp_path)) == 3, "opening decodes nothing"
 
@@ -397,7 +397,7 @@ def test_real_focus_sweeps() -> None:
     room = formats.open_stacks(Path(ROOT) / "focus_stack_room")
     assert room.format == "images" and room[0].images.shape == (1, 6, 3, 768, 1024)
     heatsink = formats.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
-    order = [int("".join(c for c in file.stem if c.isdigit())) for file in heatsink.load.pictures]
+    order = [int("".join(c for c in file.stem if c.isdigit())) for file in heatsink.load.args[0]]
     assert order == list(range(1, 50))
     # A sweep moves the focus steadily: the next picture is sharp in nearly the same places. Measured 0.97 for the order
     # of the numbers, 0.91 for the order of the letters.

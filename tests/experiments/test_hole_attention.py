@@ -2,12 +2,8 @@
 
 import pytest
 import torch
-from support.paper_protocol_runs import configured_method, small_room
-from support.rooms import Changed
 
-from dhtorch.experiments.negative import hole_attention as experiment
 from dhtorch.experiments.negative.hole_attention import largest_cluster
-from dhtorch.experiments.protocol import Settings
 from dhtorch.stages.sample import spiral
 
 HW = (120, 160)
@@ -79,44 +75,3 @@ def test_clusters_are_those_of_a_search_along_every_edge(seed):
     for b in range(3):
         member = {int(k) for k in found.member[b].nonzero()}
         assert member in components(uv[b], hole[b], 4)
-
-
-def asked(*recordings, base=None, **options):
-    return experiment.run(list(recordings), {"paper": base or configured_method()}, None, Settings(), **options)
-
-
-def punched(frame):
-    """Exact depth except for one region of known place and size."""
-    depth = frame.depth.clone()
-    depth[:, 96:, 128:] = 0
-    return frame.replace(depth=depth)
-
-
-def test_a_known_region_without_returns_is_looked_at_in_vain():
-    outcome = asked(Changed(small_room(lidar="exact"), punched), stride=2)
-    found = {v: next(iter(outcome.scenes(v, "sensor").values())) for v in experiment.VARIANTS}
-    assert found["even"]["hole_rate"] == pytest.approx(0.25, abs=0.02), "a quarter of the picture"
-    assert found["attention"]["hole_rate"] > 0.5 > found["centre"]["hole_rate"]
-    assert found["attention"]["rise"] == pytest.approx(
-        found["attention"]["hole_rate"] - found["centre"]["hole_rate"], abs=1e-9
-    )
-    assert found["attention"]["cluster_returns"] < 0.05 and found["centre"]["cluster_returns"] == 0
-    assert found["centre"]["cluster_share"] > 0.98
-    assert found["attention"]["gaze_way_px"] == pytest.approx(80, abs=15)
-    assert outcome.verdict == "supported" and "0.67, 0.78" in outcome.why
-
-
-def test_classes_and_routes_are_shares_of_the_holes():
-    outcome = asked(small_room(), stride=3)
-    for row in outcome.rows:
-        assert sum(row["hole_share"].values()) == pytest.approx(1)
-        assert sum(row["route_share"].values()) == pytest.approx(1)
-    assert {"attention.route_share.triangulate", "centre.hole_share.too_dark"} <= set(outcome.summary)
-
-
-def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
-    full = asked(small_room(lidar="exact", hw=(96, 128)), stride=5)
-    assert (
-        full.verdict == "undecided"
-        and full.scenes("attention", "sensor")["synthetic_room"]["note"] == "nothing to estimate"
-    )

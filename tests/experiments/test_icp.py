@@ -4,12 +4,8 @@ import math
 
 import pytest
 import torch
-from support.paper_protocol_runs import configured_method, small_room
-from support.rooms import Changed
 
-from dhtorch.experiments.negative import icp as experiment
 from dhtorch.experiments.negative.icp import estimate_normals, register_icp
-from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
 
@@ -48,16 +44,6 @@ TRUE = se3.exp(torch.tensor([[0.03, -0.05, 0.02, 0.06, -0.04, 0.05]]).double())
 START = se3.identity(1, torch.zeros(1).double())
 
 
-def test_the_same_points_are_brought_back_exactly():
-    q = surface(900)
-    x = se3.apply(se3.invert(TRUE), q)
-    for planes in (None, estimate_normals(q)):
-        found = register_icp(x, q, START, normals_1=planes)
-        angle, distance = off(found.T_1_from_0, TRUE)
-        assert angle < 1e-3 and distance < 1e-5 and bool(found.ok) and float(found.inlier_share) == 1
-        assert float(found.rms_m) < 1e-5 and 0 < float(found.condition) <= 1
-
-
 def test_points_agree_with_the_textbook_on_dense_clouds():
     q, x = surface(1200, 1), se3.apply(se3.invert(TRUE), surface(600, 2))
     found = register_icp(x, q, START, reach_m=0.2, least_reach_m=0.2, keep=1.0, iterations=40)
@@ -74,17 +60,6 @@ def test_planes_forgive_other_samples_of_the_same_surface():
     worse, better = off(point.T_1_from_0, TRUE), off(plane.T_1_from_0, TRUE)
     assert better[1] < 0.004 and better[0] < 0.2
     assert worse[1] > 2 * better[1] and float(point.rms_m) > 2 * float(plane.rms_m), "nearest is not the same point"
-
-
-def test_masked_points_and_batch_mates_change_nothing():
-    q, x = surface(400, 1).float(), surface(300, 2).float()
-    hole = torch.full((1, 60, 3), torch.nan)
-    alone = register_icp(x, q, START.to(torch.float32))
-    padded = register_icp(torch.cat((x, hole), 1), torch.cat((hole, q), 1), START.to(torch.float32))
-    for field in ("rms_m", "inlier_share", "condition"):
-        torch.testing.assert_close(getattr(alone, field), getattr(padded, field))
-    torch.testing.assert_close(alone.T_1_from_0.t, padded.T_1_from_0.t)
-    assert not bool(padded.matched[:, 300:].any()) and torch.equal(padded.matched[:, :300], alone.matched)
 
 
 def test_trimming_survives_what_the_other_view_does_not_show():
@@ -122,39 +97,3 @@ def test_what_cannot_be_registered_is_flagged():
     assert float(bumpy.condition) > 1e-4
     lost = Pose(START.R * torch.nan, START.t)
     assert not bool(register_icp(q, q, lost).ok)
-
-
-def asked(*recordings, **options):
-    return experiment.run(
-        list(recordings), {"paper": configured_method()}, None, Settings(), **{"n": 300, "links": 3, **options}
-    )
-
-
-def test_the_exact_pose_cannot_be_improved_and_no_pose_can():
-    outcome = asked(small_room(lidar="exact", path="lateral", step_m=0.04), poor_deg=4.0, n=500, min_inlier_share=0.2)
-    found = {v: outcome.scenes(v, "trajectory")["synthetic_room"] for v in experiment.VARIANTS}
-    assert found["good"]["drift_rel"] < 1e-9 and found["good"]["right_share"] == 1
-    assert found["good + icp points"]["drift_rel"] > 0.001 and found["good + icp points"]["right_share"] < 1
-    assert found["poor"]["rotation_deg"] == pytest.approx(4.0, abs=1e-6)
-    assert found["poor + icp points"]["rotation_deg"] < 2.5
-    assert found["none + icp points"]["drift_rel"] < found["none"]["drift_rel"]
-    assert all(found[v]["n_voxels"] == found[v]["n_voxels_all"] for v in experiment.ICP_POSE_SOURCES)
-    assert len([r for r in outcome.rows if r["pair"] is not None]) == 9 * 2
-
-
-def test_links_without_confidence_leave_the_map_and_keep_the_pose():
-    recording = small_room(lidar="exact")
-    outcome = asked(recording, min_inlier_share=1.01)
-    found = {v: outcome.scenes(v, "trajectory")["synthetic_room"] for v in experiment.VARIANTS}
-    alone, refined = found["good"], found["good + icp points"]
-    assert refined["confident_share"] == 0 and refined["drift_rel"] < 1e-9
-    assert refined["n_voxels"] < alone["n_voxels"] == refined["n_voxels_all"]
-    assert refined["voxels_vs_pose"] == refined["n_voxels"] / alone["n_voxels"] and alone["voxels_vs_pose"] == 1
-    assert outcome.verdict == "refuted", "without confidence nothing is gained where there is no pose"
-
-
-def test_a_scene_without_trajectory_or_depth_has_no_answer():
-    blind, empty = Changed(small_room(), poses=None), small_room(lidar=None)
-    assert experiment.verdict(asked(blind))[0] is None
-    silent = asked(empty)
-    assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to estimate" and len(silent.rows) == 9

@@ -120,14 +120,6 @@ def test_dinov2_shapes_seed_and_local_weights(tmp_path):
         dinov2.load_dinov2(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize(
-    ("times", "q", "expected"),
-    [*((range(101), q, 100 * q) for q in (0.5, 0.95, 0.99)), ([1.0, 2.0], 0.5, 1.5), ([7.0], 0.99, 7)],
-)
-def test_percentiles(times, q, expected):
-    assert latency.percentile([float(t) for t in times], q) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize(("value", "dtype"), [(0.5, torch.float32), (51, torch.uint8)])
 def test_pixel_values_are_centred(value, dtype):
     found = dinov2.preprocess_image(torch.full((1, 1, 30, 30), value, dtype=dtype), 28)

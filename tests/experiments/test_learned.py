@@ -201,19 +201,14 @@ def test_networks_are_measured_on_our_candidates(room, installed):
     rows = {r["method"]: r for r in outcome.rows if r["pair"] is None}
     assert list(rows) == ["paper", "dust3r_oracle", "dust3r_near", "vggt_oracle", "vggt_near"]
     assert len({r["n_candidates"] for r in rows.values()}) == 1 and rows["paper"]["n_candidates"] > 50
-    assert len({str(r["n_dropped"]) for r in rows.values()}) == 1
-    for name, row in rows.items():
-        if name == "paper":
-            assert (row["scale"], row["metric"], row["parameters"]) == ("sensor", "yes", 0) and "on_ours" not in row
-            continue
-        oracle = name.endswith("oracle")
+    assert (rows["paper"]["scale"], rows["paper"]["metric"], rows["paper"]["parameters"]) == ("sensor", "yes", 0)
+    for name in list(rows)[1:]:
+        row, oracle = rows[name], name.endswith("oracle")
         assert (row["scale"], row["metric"]) == (("oracle", "no") if oracle else ("near", "yes"))
-        assert row["parameters"] == (5 if name.startswith("dust3r") else 7) and row["device"] == "cpu"
+        assert row["parameters"] == (5 if name.startswith("dust3r") else 7) and row["pnp_success"] is None
         assert row["median_rel"] < 0.02 and row["coverage"] > 0.9, "a network that reads the truth is nearly exact"
-        assert abs(row["scale_factor"] - UNIT) < 0.1 and row["scale_pixels"] > 500
-        assert row["on_ours"]["n_kept"] <= rows["paper"]["n_kept"] and row["on_ours"]["median_rel"] < 0.02
-        assert row["pnp_success"] is None and row["seconds_per_video"] > 0
-        assert f"{name}.on_ours.median_rel" in outcome.summary and f"{name}.seconds_per_video" in outcome.summary
+        assert abs(row["scale_factor"] - UNIT) < 0.1 and row["scale_pixels"] > 500 and row["seconds_per_video"] > 0
+        assert row["on_ours"]["median_rel"] < 0.02 and f"{name}.on_ours.median_rel" in outcome.summary
     assert outcome.verdict == "supported" and "1 of 1" in outcome.why
     storage.to_strict_json(outcome.rows)
 

@@ -13,7 +13,6 @@ from support.rooms import room_scene
 
 from dhtorch import data
 from dhtorch.cli.run import config_dir
-from dhtorch.codes import Gate, names
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments import pair, protocol
 from dhtorch.stages.track import lucas_kanade
@@ -61,48 +60,8 @@ def test_the_room_of_every_seed_keeps_its_bound(seed):
     assert row["median_rel"] < BOUNDS[seed] and row["wrong_share"] < 0.005 and row["coverage"] > 0.9, row
 
 
-@pytest.mark.slow
-def test_room_with_the_phone_lidar():
-    room = rendered(hw=(240, 320), n_frames=8)
-    outcome = pair.run([room_scene(room)], {"paper": method("paper")}, by_gap, pair.Settings())
-    row = scene_row(outcome)
-    assert row["coverage"] > 0.9 and row["median_rel"] < 0.03, row
-    shares = row["hole_share"]
-    assert abs(sum(shares.values()) - 1) < 1e-6 and shares["trackable_no_lidar"] > 0.7
-    assert set(row["gate_share"]) == {g.lower() for g in names(Gate).values()}
-    assert outcome.summary["median_rel"]["value"] == row["median_rel"]
-    assert outcome.examples[0].scene == "synthetic_room" and outcome.n_pairs == 2
-
-
 def small(**options):
     return rendered(hw=(120, 160), n_frames=4, **options)
-
-
-def test_without_a_cutoff_there_is_no_truth():
-    outcome = pair.run(
-        [room_scene(small())],
-        {"paper": method("paper_direct")},
-        partial(by_gap, gap=2),
-        pair.Settings(cutoff=float("inf")),
-    )
-    row = scene_row(outcome)
-    assert row["n_candidates"] == 0 and row["median_rel"] is None and row["n_pairs"] == 2
-    assert row["pnp_success"] == 1.0 and row["n_recovered"] > 0
-
-
-def test_pairs_with_few_candidates_are_dropped_and_counted():
-    outcome = pair.run(
-        [room_scene(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=50.0)
-    )
-    row = scene_row(outcome)
-    assert row["n_few"] == 2 and row["n_pairs"] == 0 and "median_rel" not in row
-
-
-@pytest.mark.slow
-def test_a_rotation_scene_never_enters_the_summary():
-    rotation = small(path="rotation", lidar="exact")
-    outcome = pair.run([room_scene(rotation)], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
-    assert scene_row(outcome)["role"] == "rotation" and outcome.summary == {}
 
 
 def test_variants_share_tracks_and_pay_for_them():
@@ -144,42 +103,6 @@ def test_views_of_a_window_are_shared_too():
     assert len(asked) == 3 and asked[0] is None and asked[2] is not None, "one search for each view, not for each seed"
     first, second = (scene_row(outcome, method=name) for name in variants)
     assert first["ms"]["track"] == pytest.approx(second["ms"]["track"], rel=0.5)
-
-
-def test_a_scene_without_pairs_keeps_a_row_that_says_so():
-    room = small()
-    outcome = protocol.run(
-        [room], protocol.Protocol({"paper": protocol.Variant(method("paper"))}), lambda _: [], protocol.Settings()
-    )
-    assert scene_row(outcome)["note"] == "too short" and outcome.summary["n_pairs"]["value"] == 0
-
-
-def test_curves_of_a_scene_are_what_its_points_say():
-    outcome = pair.run(
-        [room_scene(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings()
-    )
-    row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
-    curve = row["curves"]["risk_coverage"]
-    five_digits = partial(pytest.approx, rel=1e-4)
-    assert curve["coverage"][-1] == five_digits(row["coverage"])
-    assert curve["median_rel"][-1] == five_digits(row["median_rel"])
-    assert curve["risk"][-1] == five_digits(float(points.answered().error.clamp(max=1).mean()))
-    assert all(a >= b for a, b in zip(curve["risk"], curve["oracle"], strict=True))
-    distance = row["curves"]["distance"]
-    assert distance["depth"] == sorted(distance["depth"]) and len(distance["coverage"]) == 10
-    assert sum(row["curves"]["reliability"]["weight"]) == five_digits(1)
-
-
-def test_candidates_do_not_depend_on_the_method():
-    methods = {name: method(name) for name in ("paper", "opencv")}
-    settings = pair.Settings(truth=("raw", "5x5", "full"))
-    outcome = pair.run([room_scene(small(lidar="exact"))], methods, partial(by_gap, gap=2), settings)
-    for truth in ("raw", "5x5", "full"):
-        a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)
-        assert a["n_candidates"] == b["n_candidates"] and a["n_dropped"] == b["n_dropped"]
-    counts = [scene_row(outcome, method="paper", truth=t)["n_candidates"] for t in ("raw", "5x5", "full")]
-    assert counts[0] > counts[1] > counts[2]
-    assert {"paper.median_rel", "opencv.median_rel", "paper.raw.median_rel"} <= set(outcome.summary)
 
 
 @pytest.mark.slow

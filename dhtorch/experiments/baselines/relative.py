@@ -29,7 +29,35 @@ _VGGT_HINT = "clone github.com/facebookresearch/vggt and pip install it"
 _PATCH_PX = 14
 
 
-class VGGT:
+class _PairNetwork:
+    """A network of two views; a pair is computed alone."""
+
+    def _sizes(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Size to which an image is resized, and that of the crop around its centre."""
+        raise NotImplementedError
+
+    def _predict(self, view_0: Tensor, view_1: Tensor) -> tuple[Tensor, Tensor]:
+        """Two inputs (1, 3, h, w) in [0, 1] → depth and confidence (1, h, w) in the first."""
+        raise NotImplementedError
+
+    def _check_weights(self, weights: str | Path) -> Path:
+        if not Path(weights).exists():
+            name = type(self).__name__
+            raise FileNotFoundError(f"{weights}: found nothing, expected {name} weights, a file or a folder")
+        return Path(weights)
+
+    @torch.no_grad()
+    def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
+        """Depth of view 0 from B pairs; the frames' own depth is not used."""
+        (view_0, gain, shift), (view_1, _, _) = (
+            resize_and_crop(f.image, *self._sizes(*f.hw)) for f in (frame_0, frame_1)
+        )
+        answers = [self._predict(*pair) for pair in zip(view_0.split(1), view_1.split(1), strict=True)]
+        depth, confidence = (torch.cat(x).to(frame_0.camera.f) for x in zip(*answers, strict=True))
+        return RelativeDepth(depth, confidence, *(x.to(depth).expand(len(view_0), 2) for x in (gain, shift)))
+
+
+class VGGT(_PairNetwork):
     """Pairs of frames → :class:`RelativeDepth` of the first, one pair at a time.
 
     Images are resized to ``width`` and a multiple of 14 in height, which is cropped around the centre to at most
@@ -44,6 +72,7 @@ class VGGT:
     Raises:
         ImportError: VGGT is not importable.
         FileNotFoundError: no such weights; nothing is ever downloaded.
+        ValueError: of the call, two views of different size.
     """
 
     def __init__(self, weights: str | Path, *, width: int = 518, device: str = "cpu") -> None:
@@ -51,9 +80,7 @@ class VGGT:
             from vggt.models.vggt import VGGT as Network  # noqa: PLC0415  (optional)
         except ImportError as error:
             raise ImportError(f"VGGT cannot be imported ({error}): {_VGGT_HINT}") from error
-        path = Path(weights)
-        if not path.exists():
-            raise FileNotFoundError(f"{weights}: found nothing, expected VGGT weights, a file or a folder")
+        path = self._check_weights(weights)
         if path.is_dir():
             network = Network.from_pretrained(str(path))
         else:
@@ -63,34 +90,20 @@ class VGGT:
         self.width, self.device = width, device
 
     def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
-        """Depth of view 0 from B pairs; the frames' own depth is not used.
-
-        Raises:
-            ValueError: the two views are of different size.
-        """
+        """Depth of view 0 from B pairs of views of one size; the frames' own depth is not used."""
         if frame_0.hw != frame_1.hw:
             raise ValueError(f"VGGT: views of {frame_0.hw} and {frame_1.hw} pixels, expected the same size")
-        view_0, gain, shift = self._fit(frame_0.image)
-        view_1, _, _ = self._fit(frame_1.image)
-        depth, confidence = [], []
-        device_type = torch.device(self.device).type
-        for pair in torch.stack((view_0, view_1), 1).to(self.device):
-            with torch.no_grad(), torch.autocast(device_type, dtype=torch.bfloat16, enabled=device_type == "cuda"):
-                prediction = self.network(pair)
-            depth.append(prediction["depth"][:, 0, ..., 0])
-            confidence.append(prediction["depth_conf"][:, 0])
-        like = frame_0.camera.f
-        return RelativeDepth(
-            depth=torch.cat(depth).to(like),
-            confidence=torch.cat(confidence).to(like),
-            gain=gain.to(like).expand(view_0.shape[0], 2),
-            shift=shift.to(like).expand(view_0.shape[0], 2),
-        )
+        return super().__call__(frame_0, frame_1)
 
-    def _fit(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        height, width = image.shape[-2:]
+    def _sizes(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
         resized_height = max(round(height * self.width / width / _PATCH_PX), 1) * _PATCH_PX
-        return resize_and_crop(image, (resized_height, self.width), (min(resized_height, self.width), self.width))
+        return (resized_height, self.width), (min(resized_height, self.width), self.width)
+
+    def _predict(self, view_0: Tensor, view_1: Tensor) -> tuple[Tensor, Tensor]:
+        device_type = torch.device(self.device).type
+        with torch.autocast(device_type, dtype=torch.bfloat16, enabled=device_type == "cuda"):
+            prediction = self.network(torch.cat((view_0, view_1)).to(self.device))
+        return prediction["depth"][:, 0, ..., 0], prediction["depth_conf"][:, 0]
 
 
 #: Installation of the package.
@@ -102,7 +115,7 @@ _INSTALL_HINT = (
 _SIDE_MULTIPLE_PX = 16
 
 
-class DUSt3R:
+class DUSt3R(_PairNetwork):
     """Pairs of frames → :class:`RelativeDepth` of the first, one pair at a time.
 
     Images are resized so that the longer side is ``size``, then cropped around the centre to multiples of 16, and
@@ -125,46 +138,29 @@ class DUSt3R:
             from dust3r.model import AsymmetricCroCo3DStereo  # noqa: PLC0415
         except ImportError as error:
             raise ImportError(f"DUSt3R cannot be imported ({error}): {_INSTALL_HINT}") from error
-        if not Path(weights).exists():
-            raise FileNotFoundError(f"{weights}: found nothing, expected DUSt3R weights, a file or a folder")
+        path = self._check_weights(weights)
         # The file holds the options of its training run, which torch loads only with their class declared safe.
         with torch.serialization.safe_globals([argparse.Namespace]):
-            network = AsymmetricCroCo3DStereo.from_pretrained(str(weights))
+            network = AsymmetricCroCo3DStereo.from_pretrained(str(path))
         self.network: torch.nn.Module = network.to(device).eval()
         self.size, self.device, self._inference = size, device, inference
 
-    def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
-        """Depth of view 0 from B pairs; the frames' own depth is not used."""
-        view_0, gain, shift = self._fit(frame_0.image)
-        view_1, _, _ = self._fit(frame_1.image)
-        depth, confidence = [], []
-        for b in range(view_0.shape[0]):
-            pair = (_view(view_0[b : b + 1], 0), _view(view_1[b : b + 1], 1))
-            prediction: Any = self._inference([pair], self.network, self.device, batch_size=1, verbose=False)["pred1"]
-            depth.append(prediction["pts3d"][..., 2])
-            confidence.append(prediction["conf"])
-        like = frame_0.camera.f
-        return RelativeDepth(
-            depth=torch.cat(depth).to(like),
-            confidence=torch.cat(confidence).to(like),
-            gain=gain.to(like).expand(view_0.shape[0], 2),
-            shift=shift.to(like).expand(view_0.shape[0], 2),
-        )
-
-    def _fit(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        height, width = image.shape[-2:]
+    def _sizes(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
         scale = self.size / max(height, width)
         hw = (round(height * scale), round(width * scale))
         crop_h, crop_w = (side // _SIDE_MULTIPLE_PX * _SIDE_MULTIPLE_PX for side in hw)
         if hw[0] == hw[1]:
             crop_h = 3 * crop_w // 4 // _SIDE_MULTIPLE_PX * _SIDE_MULTIPLE_PX
-        return resize_and_crop(image, hw, (crop_h, crop_w))
+        return hw, (crop_h, crop_w)
 
-
-def _view(image: Tensor, index: int) -> dict[str, Any]:
-    """Image (1, 3, h, w) in [0, 1] → input view of DUSt3R, with colours in [-1, 1]."""
-    shape = torch.tensor([list(image.shape[-2:])], dtype=torch.int32)
-    return {"img": 2 * image - 1, "true_shape": shape, "idx": index, "instance": str(index)}
+    def _predict(self, view_0: Tensor, view_1: Tensor) -> tuple[Tensor, Tensor]:
+        pair = []
+        for index, image in enumerate((view_0, view_1)):  # with colours in [-1, 1]
+            shape = torch.tensor([list(image.shape[-2:])], dtype=torch.int32)
+            pair.append({"img": 2 * image - 1, "true_shape": shape, "idx": index, "instance": str(index)})
+        run: Any = self._inference
+        prediction = run([tuple(pair)], self.network, self.device, batch_size=1, verbose=False)["pred1"]
+        return prediction["pts3d"][..., 2], prediction["conf"]
 
 
 @record

@@ -59,7 +59,10 @@ def fill_bilateral(reference: Frame, samples: Samples) -> Estimate:
     filled = weight > _MIN_WEIGHT
     round_filled = torch.zeros_like(depth)
     for k in range(_N_ROUNDS):
-        mass, total = (_joint_bilateral_blur(x, image) for x in (filled.to(depth), torch.where(filled, depth, 0.0)))
+        mass, total = (
+            joint_bilateral_blur(x, image, _FILTER_WINDOW_PX, _GREY_SIGMA, (_SPATIAL_SIGMA_PX, _SPATIAL_SIGMA_PX))
+            for x in (filled.to(depth), torch.where(filled, depth, 0.0))
+        )
         new = ~filled & (mass > _MIN_WEIGHT)
         depth = torch.where(new, total / mass.clamp_min(_MIN_WEIGHT), depth)
         round_filled = torch.where(new, 1.0 + k, round_filled)
@@ -70,13 +73,6 @@ def fill_bilateral(reference: Frame, samples: Samples) -> Estimate:
     return estimate_from_depth(
         samples, depth_at_samples, noise, torch.where(depth_at_samples > 0, Gate.ANSWER, Gate.NO_TRACK)
     )
-
-
-def _joint_bilateral_blur(x: Tensor, guide: Tensor) -> Tensor:
-    blurred: Tensor = joint_bilateral_blur(
-        x, guide, _FILTER_WINDOW_PX, _GREY_SIGMA, (_SPATIAL_SIGMA_PX, _SPATIAL_SIGMA_PX)
-    )
-    return blurred
 
 
 #: Number of disparities of the rectified search.
@@ -219,7 +215,9 @@ def _depth_from_disparity(
     """(depth in view 0, NaN without a match; its relative noise for half a pixel of disparity), (h, w) each."""
     h, w = hw
     disparity = match_disparity(rectified.pictures)
-    ray = cam.rays(camera_0, _pixel_grid(h, w).to(camera_0.f))[0].double().cpu().numpy() @ rectified.R.T
+    rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    pixels = torch.stack([columns, rows], -1).reshape(1, -1, 2).to(camera_0.f)
+    ray = cam.rays(camera_0, pixels)[0].double().cpu().numpy() @ rectified.R.T
     rectified_uv = (ray / ray[:, 2:]) @ rectified.K.T
     u, v = (rectified_uv[:, 0], rectified_uv[:, 1]) if rectified.upright else (rectified_uv[:, 1], rectified_uv[:, 0])
     if rectified.reach < 0:
@@ -247,8 +245,9 @@ def match_optical_flow(
     uv = cam.depth_pixels(reference.camera, reference.hw, None, hw, samples.uv)
     uv_1 = torch.full_like(uv, torch.nan)
     for b in range(len(uv) if _image_hw(grey_1) == hw else 0):
-        forward, backward = _flow_both_ways(
-            engine, *((255 * g[b, 0]).to(torch.uint8).cpu().numpy() for g in (grey_0, grey_1))
+        images = [(255 * g[b, 0]).to(torch.uint8).cpu().numpy() for g in (grey_0, grey_1)]
+        forward, backward = (  # (2, h, w) px each
+            torch.from_numpy(engine.calc(*pair, None)).permute(2, 0, 1).contiguous() for pair in (images, images[::-1])
         )
         step = sample_nearest(forward, uv[b : b + 1].expand(2, -1, -1).cpu())[0].T.to(uv)
         return_step, inside = sample_nearest(backward, (uv[b] + step)[None].expand(2, -1, -1).cpu())
@@ -283,23 +282,10 @@ def estimate_from_depth(samples: Samples, depth: Tensor, noise: Tensor, gate: Te
     )
 
 
-def _flow_both_ways(engine: Any, first: np.ndarray, second: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Forward and backward flow, (2, h, w) px each."""
-    forward, backward = (
-        torch.from_numpy(engine.calc(a, b, None)).permute(2, 0, 1) for a, b in ((first, second), (second, first))
-    )
-    return forward.contiguous(), backward.contiguous()
-
-
 def _opencv_camera(camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
     K = cam.to_matrix(camera)[0].double().cpu().numpy()
     distortion = None if camera.distortion is None else camera.distortion[0].double().cpu().numpy()
     return K, distortion
-
-
-def _pixel_grid(h: int, w: int) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-    return torch.stack([u, v], -1).reshape(1, -1, 2)
 
 
 def _image_hw(grey: Tensor) -> tuple[int, int]:

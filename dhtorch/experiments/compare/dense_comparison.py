@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -25,11 +25,25 @@ from dhtorch.codes import Gate, is_estimated
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
-from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import stereo
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.outcome import Bars, Row, join_outcomes, judge_bars
-from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    MIN_CANDIDATES,
+    Answer,
+    Batch,
+    Cohort,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    held_back_truth,
+    no_progress,
+    run_protocol,
+    spread_pairs,
+)
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.filters import grayscale
@@ -42,11 +56,6 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import DepthMap, Estimate, Frame, Pose, PoseFit, Samples
 from dhtorch.synthetic import SyntheticRoom
-
-QUESTION = "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?"
-EXPECTATION = (
-    "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were not fitted on."
-)
 
 #: Number → (least, largest) value.
 DENSE_BARS: Bars = {
@@ -74,19 +83,11 @@ _PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
 _RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 
 
-@dataclass(frozen=True)
-class ReferenceSweep:
-    """Sparse answers and maps of one reference view, computed once for all variants."""
-
-    reference: Frame
-    trace: Trace  # of the sparse method
-    selected: dense.SelectedViews
-    maps: Mapping[int, DepthMap]  # by the number of source views
-    at_samples: Estimate  # the joint answers at the samples; of a method without them, the map's
-    grid: Samples  # pixels of the map that are evaluated
-    other: Frame  # the best source view
-    T_1_from_0: Pose  # NaN where the pose failed
-    ms: Mapping[str, float]
+#: Sparse answers and maps of one reference view, computed once for all variants: ``reference``, ``trace`` of the sparse
+#: method, ``maps`` by the number of source views, ``at_samples`` (the joint answers at the samples; of a method without
+#: them, the map's), ``grid`` (pixels of the map that are evaluated), ``other`` (the best source view), ``T_1_from_0``
+#: (NaN where the pose failed), ``ms``.
+ReferenceSweep = SimpleNamespace
 
 
 class SweepCache:
@@ -111,7 +112,12 @@ class SweepCache:
         sweep = self._last
         trace |= sweep.trace
         samples, estimate = compute(sweep)
-        trace |= {"samples": samples, "ms": dict(sweep.ms), "rectifiable": is_rectifiable(sweep)}
+        # (B,) whether the relative pose puts both epipoles outside the images, as rectification needs
+        inside = stereo.is_epipole_inside(
+            ((reference.camera, reference.hw), (sweep.other.camera, sweep.other.hw)), sweep.T_1_from_0
+        )
+        rectifiable = ~inside & sweep.T_1_from_0.t.isfinite().all(-1)
+        trace |= {"samples": samples, "ms": dict(sweep.ms), "rectifiable": rectifiable}
         trace["map"] = sweep.maps[max(sweep.maps)]
         return estimate
 
@@ -141,13 +147,11 @@ class SweepCache:
         index, _ = dense.top_views(selected, 1)
         best = index[0], torch.arange(len(index[0]), device=index.device)
         fit = selected.fits[best]
-        failed = ~fit.ok
-        R = torch.where(failed[:, None, None], torch.nan, fit.T_1_from_0.R)
-        t = torch.where(failed[:, None], torch.nan, fit.T_1_from_0.t)
+        R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R, torch.nan)
+        t = torch.where(fit.ok[:, None], fit.T_1_from_0.t, torch.nan)
         return ReferenceSweep(
             reference=reference,
             trace={**trace, "sparse": estimate},
-            selected=selected,
             maps=maps,
             at_samples=at_samples,
             grid=grid,
@@ -180,7 +184,7 @@ def run(
     rotations: Sequence[SceneLike] = (),
     convoys: Sequence[SceneLike] = (),
     rooms: Sequence[int] = (0, 1, 2),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Error, coverage and calibration of dense maps, beside sparse answers and dense baselines under the same poses.
 
@@ -224,11 +228,11 @@ def run(
         all_scenes += [scene] if scene.name not in {listed.name for listed in all_scenes} else []
     cache = SweepCache(options, stride)
     variants = _variants(sparse, cache, settings.seed, peers)
-    spread = partial(protocol.spread_pairs, pairs, reference_views)
+    spread = partial(spread_pairs, pairs, reference_views)
     parts = []
     for is_rotation in (False, True):  # also rotations without a candidate count
         selected = [scene for scene in all_scenes if (scene.role == "rotation") == is_rotation]
-        cohorts: dict[str, protocol.Cohort] = {
+        cohorts: dict[str, Cohort] = {
             _RECTIFIABLE: partial(_far_cohort, rectifiable_only=True),
             FULL_COHORT: _far_cohort,
         }
@@ -236,16 +240,23 @@ def run(
             variants,
             cohorts=cohorts,
             columns=_map_columns,
-            min_candidates=0 if is_rotation else protocol.MIN_CANDIDATES,
+            min_candidates=0 if is_rotation else MIN_CANDIDATES,
         )
-        parts.append(protocol.run(selected, dense_protocol, spread, settings, progress=progress))
+        parts.append(run_protocol(selected, dense_protocol, spread, settings, progress=progress))
     outcome = join_outcomes(parts)
     outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in all_scenes}, indoor, peers)
     outcome.summary |= compare.rotation_answered(outcome.rows, [DENSE_VARIANT])
     outcome.summary |= compare.worst_wrong_share(DENSE_VARIANT, _moving_points(outcome))
     if rooms:
         outcome.summary |= measure_rooms(rooms, sparse, options)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
+    return outcome.decide(
+        "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?",
+        (
+            "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were "
+            "not fitted on."
+        ),
+        *verdict(outcome, peers),
+    )
 
 
 def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
@@ -254,13 +265,6 @@ def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
     rows = outcome.scenes("sgbm", _RECTIFIABLE) if peers else {}
     lost = sorted(scene for scene, row in rows.items() if not row.get("n_candidates"))
     return holds, f"{why}; no pair can be rectified: {', '.join(lost)}" if lost else why
-
-
-def is_rectifiable(looked: ReferenceSweep) -> Tensor:
-    """Whether the pose is defined and both epipoles lie outside their images, (B,) bool."""
-    views = tuple((view.camera, view.hw) for view in (looked.reference, looked.other))
-    inside = stereo.is_epipole_inside(views, looked.T_1_from_0)
-    return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
 
 def sample_map(depth_map: DepthMap, samples: Samples, frame: Frame) -> Estimate:
@@ -306,7 +310,11 @@ def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict
     if peers:
         own_calibration = partial(cache.estimate, _match_own_calibration)
         variants["sgbm, own calibration"] = Variant(
-            method, estimate=own_calibration, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
+            method,
+            estimate=own_calibration,
+            seed=seed,
+            offers=candidate_frames,
+            needs=lambda scene: None if scene.recording.format == "rectified" else "not a rectified pair",
         )
     return variants
 
@@ -326,24 +334,18 @@ def _match_own_calibration(sweep: ReferenceSweep) -> tuple[Samples, Estimate]:
     return sweep.grid, _match_semi_global(sweep, T)
 
 
-def _not_rectified_reason(scene: Any) -> str | None:
-    return None if scene.recording.format == "rectified" else "not a rectified pair"
-
-
 def _far_cohort(batch: Batch, trace: Trace, *, rectifiable_only: bool = False) -> holdout.Truth:
     """Held-back returns that pass the truth test; those without texture count only for variants on all pixels."""
-    samples: Samples = trace["samples"]
-    truth = protocol.held_back_truth(batch, trace)
-    on_pixels = samples.uv.shape[1] != trace["sparse"].uv.shape[1]
+    truth = held_back_truth(batch, trace)
     code = truth.code
-    if on_pixels:
+    if trace["samples"].uv.shape[1] != trace["sparse"].uv.shape[1]:  # on pixels
         code = torch.where(code == holdout.TruthCode.TEXTURE, holdout.TruthCode.CANDIDATE, code)
     if rectifiable_only:
         code = torch.where(trace["rectifiable"][:, None], code, holdout.TruthCode.EXCLUDED)
     return truth.replace(code=code)
 
 
-def _map_columns(answer: protocol.Answer) -> Row:
+def _map_columns(answer: Answer) -> Row:
     """Shares of artefacts, and of wrong answers beside true depth steps, of the map of one reference view."""
     if answer.variant != DENSE_VARIANT:
         return {}
@@ -372,13 +374,13 @@ def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], 
     for scene, points in points_of[DENSE_VARIANT].items():
         rows[scene] |= {"ause_ratio": risk.ause(points)}
         rows[scene]["error_ratio_to_sparse"] = _error_ratio(points_of[AT_SAMPLES][scene], points_of["sparse"][scene])
-    metrics = {scene: errors.measure_errors(points) for scene, points in points_of[DENSE_VARIANT].items()}
-    summary["dense.answered"] = _interval_over([m["coverage"] for m in metrics.values()], "median")
-    summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in metrics.values()], "mean")
+    metrics = [errors.measure_errors(points) for points in points_of[DENSE_VARIANT].values()]
+    summary["dense.answered"] = _interval_over([m["coverage"] for m in metrics], "median")
+    summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in metrics], "mean")
     summary["dense.ause_ratio"] = _interval_over([row["ause_ratio"] for row in rows.values()], "median")
     for name in ("artefact_share", "step_wrong_share"):
-        shares = {scene: row.get(name) for scene, row in outcome.scenes(DENSE_VARIANT).items() if scene in rows}
-        summary[f"dense.{name}"] = _interval_over(list(shares.values()), "mean")
+        shares = [row.get(name) for scene, row in outcome.scenes(DENSE_VARIANT).items() if scene in rows]
+        summary[f"dense.{name}"] = _interval_over(shares, "mean")
     ratios = [row["error_ratio_to_sparse"] for row in rows.values()]
     summary["dense.error_ratio_to_sparse"] = _interval_over(ratios, "geometric_mean")
     summary |= _indoor_coverage(points_of, {scene for scene in rows if rooms[scene] in indoor})
@@ -460,7 +462,7 @@ def measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, An
     over answers beside a depth step (:func:`dhtorch.metrics.map_quality.step_counts`). Pixels are those of
     :func:`evaluated_pixels`.
     """
-    of_answered, of_all, at_steps = [], [], []
+    fractions = []
     for seed in seeds:
         room = SyntheticRoom(
             n_frames=max(_VIEW_FRAMES) + 1,
@@ -483,14 +485,11 @@ def measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, An
         answered = evaluated & is_estimated(depth_map.source)
         right = int((answered & ((depth_map.depth - reference.depth).abs() < 0.01 * reference.depth)).sum())
         wrong, beside = map_quality.step_counts(depth_map, reference.depth, ~odd)
-        of_answered.append(right / max(int(answered.sum()), 1))
-        of_all.append(right / max(int(evaluated.sum()), 1))
-        at_steps.append(wrong / max(beside, 1))
-    return {
-        "dense.room_step_wrong_share": _interval_over(at_steps, "mean"),
-        "dense.room_within_1": _interval_over(of_answered, "mean"),
-        "dense.room_within_1_of_all": _interval_over(of_all, "mean"),
-    }
+        parts = ((wrong, beside), (right, int(answered.sum())), (right, int(evaluated.sum())))
+        fractions.append([part / max(whole, 1) for part, whole in parts])
+    names = ("room_step_wrong_share", "room_within_1", "room_within_1_of_all")
+    columns = zip(names, zip(*fractions, strict=True), strict=True)
+    return {f"dense.{name}": _interval_over(values, "mean") for name, values in columns}
 
 
 def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:

@@ -45,11 +45,6 @@ from dhtorch.pipeline.spec import Trace
 from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate, Frame, Pose
 
-QUESTION = "How accurate are feed-forward networks on the same points, given the scale?"
-EXPECTATION = (
-    "With an oracle's scale VGGT has a smaller median error than ours on most scenes, on the points ours answers."
-)
-
 #: Source of a network's scale → whether its depth is then metric.
 _SCALE_SOURCES = {"oracle": "no", "near": "yes"}
 
@@ -126,10 +121,24 @@ def run(
                 "metric": _SCALE_SOURCES[scale],
                 **memory.count_weights(getattr(network, "network", network)),
             }
-    outcome = protocol.run(scenes, Protocol(variants, columns=_scale_columns), pairs, settings, progress=progress)
+
+    def scale_columns(answer: protocol.Answer) -> Row:
+        scale = answer.trace.get("scale")
+        return (
+            {} if scale is None else {"scale_factor": float(scale.factor[0]), "scale_pixels": float(scale.n_pixels[0])}
+        )
+
+    outcome = protocol.run(scenes, Protocol(variants, columns=scale_columns), pairs, settings, progress=progress)
     _complete_rows(outcome, ours, labels, settings.device)
     outcome.summary = summarise_rows(outcome.rows, list(variants), list(settings.truth))
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, ours, f"{_DECIDING_NETWORK}_oracle"))
+    return outcome.decide(
+        "How accurate are feed-forward networks on the same points, given the scale?",
+        (
+            "With an oracle's scale VGGT has a smaller median error than ours on most scenes, on the points "
+            "ours answers."
+        ),
+        *verdict(outcome, ours, f"{_DECIDING_NETWORK}_oracle"),
+    )
 
 
 class CachedNetwork:
@@ -232,11 +241,6 @@ def _scale_reference(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
     """Reference view whose depth determines the scale: its truth, or the near returns that ours uses too."""
     reference = batch.exact if scale == "oracle" else holdout.range_split(batch.reference, batch.cutoff)
     return {"known": reference, "seed": seed}
-
-
-def _scale_columns(answer: protocol.Answer) -> Row:
-    scale = answer.trace.get("scale")
-    return {} if scale is None else {"scale_factor": float(scale.factor[0]), "scale_pixels": float(scale.n_pixels[0])}
 
 
 def _complete_rows(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: str) -> None:

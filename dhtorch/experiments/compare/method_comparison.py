@@ -21,20 +21,25 @@ from dhtorch.data.pairs import candidate_frames, to_fixed_pairs
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
-from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import xfeat
 from dhtorch.experiments.outcome import Row
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Answer,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.uncertainty import disjoint_agreement
 from dhtorch.records import Estimate
 from dhtorch.stages.track_chain import track_chain
-
-QUESTION = "Is map more accurate than paper, and are its sigma and score calibrated?"
-EXPECTATION = (
-    "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were not fitted on."
-)
 
 #: Number → (bar, whether it holds); the second of two bars is for a method of several views.
 METHOD_BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
@@ -84,7 +89,7 @@ def run(
     exact: Sequence[str] = (),
     floors: Mapping[str, float] | None = None,
     disjoint: Sequence[str] = (),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors and coverages of several methods on the same pairs, several seeds each, relative to a reference.
 
@@ -152,7 +157,7 @@ def run(
         for name, half in product(disjoint, (0, 1))
     }
     columns = _SigmaColumns({name for name, variant in variants.items() if variant.states_sigma}, disjoint)
-    outcome = protocol.run(scenes, Protocol(variants, columns=columns), pairs, settings, progress=progress)
+    outcome = run_protocol(scenes, Protocol(variants, columns=columns), pairs, settings, progress=progress)
     for name in disjoint:
         _join_halves(outcome, name)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
@@ -192,7 +197,14 @@ def run(
         row = outcome.scenes(str(numbers["method"]))[str(numbers["scene"])]
         row[f"against_{reference}"] = {k: v for k, v in numbers.items() if k not in ("scene", "method")}
     without_sigma = {name for name in compared if not methods[name].states_sigma}
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several), agreement, without_sigma))
+    return outcome.decide(
+        "Is map more accurate than paper, and are its sigma and score calibrated?",
+        (
+            "Every number of the list of bars is met; scenes are the unit, thresholds hold in rooms they were "
+            "not fitted on."
+        ),
+        *verdict(comparison, compared, set(several), agreement, without_sigma),
+    )
 
 
 def verdict(

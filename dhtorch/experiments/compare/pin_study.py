@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from random import Random
 from statistics import median
@@ -71,17 +71,6 @@ _REAL_SETS = (("gr00t_demo", 2.0), ("lerobot_g1", 8.0))
 #: Frames of a real episode that are compared, and the field of view assumed for them, degrees.
 _REAL_FRAMES, _REAL_FOV_DEG = 8, 60.0
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("found_2px", larger_is_better=True),
-    MainMetric("false_alarms", larger_is_better=False),
-    MainMetric("unknown", larger_is_better=False),
-    MainMetric("error_mm_half", larger_is_better=False),
-    MainMetric("error_deg_half", larger_is_better=False),
-)
-
-PIN_QUESTION = "Does a reference view tell whether its camera was moved, and by how much?"
-PIN_EXPECTATION = "Every number of the list of bars is met; scenes are the unit of fractions."
 
 #: Number → (least, largest) value of its bar.
 PIN_BARS: Bars = {
@@ -98,28 +87,13 @@ PIN_BARS: Bars = {
 }
 
 
-@dataclass(frozen=True)
-class PlantedMove:
-    """One rendered picture of a fixed camera."""
-
-    kind: str  # "shift" (px), "turn" (degrees), "ahead" (m), "zoom" (fraction) or "still"
-    size: float
-    light: str
-    T_ref_from_live: Pose
-    frame: Frame
+#: One rendered image of a fixed camera: its row (kind: "shift" in px, "turn" in degrees, "ahead" in m, "zoom" as a
+#: fraction, or "still"; size; light), ``T_ref_from_live``, and the frame.
+PlantedMove = tuple[Row, Pose, Frame]
 
 
-@dataclass(frozen=True)
-class FixedScene:
-    """A reference view of a camera, and pictures before and after moves."""
-
-    name: str
-    reference: Frame
-    pictures: tuple[PlantedMove, ...]
-
-
-def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int = 2) -> FixedScene:
-    """Reference and pictures of a camera in the room of a seed: a view of the ``room``, or of things at a ``robot``."""
+def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int = 2) -> list[PlantedMove]:
+    """Images of a camera in the room of a seed, the reference first: views of the ``room``, or at a ``robot``."""
     draw = Random(f"pin {kind} {seed}")
     if kind == "robot":
         if seed not in _HAND_VIEWS:
@@ -137,16 +111,16 @@ def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int 
     wanted = [(name, size) for name, of in sizes.items() for size in of[seed % 2]]
     moves = [(name, size, _draw_move(name, size, depth, still.camera, draw)) for name, size in wanted]
     moves = [("still", 0.0, se3.identity(1, here.t)), *moves]
-    pictures = []
+    images: list[PlantedMove] = []
     for k, light in enumerate(ROOM_LIGHTS):
         mine = [moves[0], *moves[1 + k :: len(ROOM_LIGHTS)]]
         poses = collate(se3.compose(here, T) for _, _, T in mine)
         room = LitRoom(light=light, n_frames=len(mine), true_poses=poses, **options)
-        pictures += [PlantedMove(name, size, light, T, room[i]) for i, (name, size, T) in enumerate(mine)]
+        images += [({"kind": name, "size": size, "light": light}, T, room[i]) for i, (name, size, T) in enumerate(mine)]
         lens = LitRoom(light=light, n_frames=1, true_poses=here, **options)
         lens.camera = lens.camera.replace(f=lens.camera.f * (1 + (zoom := FOCAL_CHANGES[seed % 2][k])))
-        pictures.append(PlantedMove("zoom", zoom, light, moves[0][2], lens[0]))
-    return FixedScene(f"{kind}_{seed}", pictures[0].frame, tuple(pictures))
+        images.append(({"kind": "zoom", "size": zoom, "light": light}, moves[0][2], lens[0]))
+    return images
 
 
 def _draw_move(kind: str, size: float, depth: Tensor, camera: Camera, draw: Random) -> Pose:
@@ -158,10 +132,8 @@ def _draw_move(kind: str, size: float, depth: Tensor, camera: Camera, draw: Rand
         return Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, size]], dtype=torch.float64))
     if kind == "turn":
         return se3.exp(torch.cat((turn * math.radians(size), 0 * shift))[None])
-    share = draw.uniform(0.2, 0.8)
-    z = float(depth.median())
-    xi = torch.cat((share * turn, (1 - share) * z * shift))[None] / float(camera.f.mean())
-    scale = size
+    part, scale = draw.uniform(0.2, 0.8), size
+    xi = torch.cat((part * turn, (1 - part) * float(depth.median()) * shift))[None] / float(camera.f.mean())
     for _ in range(6):
         scale *= size / max(median_flow(se3.exp(scale * xi), depth, camera), 1e-9)
     return se3.exp(scale * xi)
@@ -178,14 +150,15 @@ def median_flow(T_ref_from_live: Pose, depth: Tensor, camera: Camera) -> float:
     return float((moved - uv).norm(dim=-1).median())
 
 
-def live_pictures(scene: FixedScene, draws: int) -> Iterator[tuple[PlantedMove, float, Frame]]:
-    """Every rendered picture, taken again ``draws`` times with other exposure, noise and arms: (move, share, frame)."""
-    for move in scene.pictures:
-        for k in range(draws * (3 if move.kind == "still" else 1)):
-            draw = Random(f"{scene.name} {move.kind} {move.size} {move.light} {k}")
-            share = _LIVE_SHARES[k % len(_LIVE_SHARES)]
-            frame, _ = hide_behind_arms(move.frame, share, arm_seed=k % 2, draw=draw)
-            yield move, share, photograph_again(frame, draw)
+def live_images(scene: str, images: Sequence[PlantedMove], draws: int) -> Iterator[PlantedMove]:
+    """Every rendered image, taken again ``draws`` times with other exposure, noise and arms; the row states the hidden
+    fraction."""
+    for row, T, rendered in images:
+        for k in range(draws * (3 if row["kind"] == "still" else 1)):
+            draw = Random(f"{scene} {row['kind']} {row['size']} {row['light']} {k}")
+            hidden = _LIVE_SHARES[k % len(_LIVE_SHARES)]
+            frame, _ = hide_behind_arms(rendered, hidden, arm_seed=k % 2, draw=draw)
+            yield row | {"hidden": hidden}, T, photograph_again(frame, draw)
 
 
 def run(
@@ -216,62 +189,71 @@ def run(
     over scenes; ``half`` are pictures half hidden by arms; errors and coverage of sigma are over pictures of moved
     cameras, the coverage of the six components of the offset.
     """
-    outcome = Outcome(metrics=_METRICS)
+    outcome = Outcome(
+        metrics=(
+            MainMetric("found_2px", larger_is_better=True),
+            MainMetric("false_alarms", larger_is_better=False),
+            MainMetric("unknown", larger_is_better=False),
+            MainMetric("error_mm_half", larger_is_better=False),
+            MainMetric("error_deg_half", larger_is_better=False),
+        )
+    )
     times: list[dict[str, float]] = []
     places = [*(("room", seed) for seed in rooms), *(("robot", seed) for seed in robots)]
     for kind, seed in progress(places, "scenes", len(places)):
-        scene = render_scene(kind, seed, (hw[0], hw[1]))
+        scene, images = f"{kind}_{seed}", render_scene(kind, seed, (hw[0], hw[1]))
         # the reference with arms over a part of it, as a robot stands in its camera's view
-        draw = Random(f"{scene.name} reference")
-        reference, _ = hide_behind_arms(scene.reference, _REFERENCE_SHARE, arm_seed=0, draw=draw)
+        draw = Random(f"{scene} reference")
+        reference, _ = hide_behind_arms(images[0][2], _REFERENCE_SHARE, arm_seed=0, draw=draw)
         pin = CameraPin(reference, seed=settings.seed)
-        outcome.rows += [_picture_row(scene, pin, *picture) for picture in live_pictures(scene, draws)]
-        times.append(_time_ratio(scene, pin))
+        outcome.rows += [_image_row(scene, pin, *image) for image in live_images(scene, images, draws)]
+        times.append(_time_ratio(scene, images, pin))
         outcome.n_pairs = len(outcome.rows)
     if real:
         outcome.rows += _real_rows(scenes_root(root))
     outcome.summary = summarise_pin(outcome.rows, times)
-    return outcome.decide(PIN_QUESTION, PIN_EXPECTATION, *judge_bars(outcome.summary, PIN_BARS))
+    return outcome.decide(
+        "Does a reference view tell whether its camera was moved, and by how much?",
+        "Every number of the list of bars is met; scenes are the unit of fractions.",
+        *judge_bars(outcome.summary, PIN_BARS),
+    )
 
 
-def _picture_row(scene: FixedScene, pin: CameraPin, move: PlantedMove, share: float, frame: Frame) -> Row:
-    """One live picture -> row with the verdict and, where there is one, the error of the offset."""
+def _image_row(scene: str, pin: CameraPin, planted: Row, T_ref_from_live: Pose, frame: Frame) -> Row:
+    """One live image -> row with the verdict and, where there is one, the error of the offset."""
     result = pin.check(frame.image)
-    row: Row = {"scene": scene.name, "pair": [0, 0], "method": "pin", "truth": None, "kind": move.kind}
-    row |= {"size": move.size, "light": move.light, "hidden": share}
-    row |= {
-        "verdict": name(PinVerdict, int(result.verdict)).lower(),
-        "reason": name(PinReason, int(result.reason)).lower(),
-    }
+    row: Row = {"scene": scene, "pair": [0, 0], "method": "pin", "truth": None, **planted}
+    row["verdict"] = name(PinVerdict, int(result.verdict)).lower()
+    row["reason"] = name(PinReason, int(result.reason)).lower()
     if int(result.verdict) == PinVerdict.CANNOT_KNOW:
         return row
-    error = se3.log(se3.compose(result.T_ref_from_live, se3.invert(move.T_ref_from_live)))[0]
-    sigmas = error / result.cov[0].diagonal().sqrt()
-    row |= {"shift_px": float(result.shift_px), "sigma_px": float(result.shift_sigma_px)}
-    row |= {"error_mm": 1e3 * float((result.T_ref_from_live.t - move.T_ref_from_live.t).norm())}
-    row |= {"error_deg": math.degrees(float(error[:3].norm())), "sigmas": sigmas.tolist()}
-    return row
-
-
-def _time_ratio(scene: FixedScene, pin: CameraPin) -> dict[str, float]:
-    """Time of one picture over that of one pair of the method ``map``, the least of alternating runs: plain and half
-    hidden."""
-    moved = next(move for move in scene.pictures if move.kind == "shift")
-    draw = Random(f"{scene.name} time")
-    pictures = {
-        "time_ratio": moved.frame,
-        "time_ratio_half": hide_behind_arms(moved.frame, 0.5, arm_seed=1, draw=draw)[0],
+    error = se3.log(se3.compose(result.T_ref_from_live, se3.invert(T_ref_from_live)))[0]
+    return row | {
+        "shift_px": float(result.shift_px),
+        "sigma_px": float(result.shift_sigma_px),
+        "error_mm": 1e3 * float((result.T_ref_from_live.t - T_ref_from_live.t).norm()),
+        "error_deg": math.degrees(float(error[:3].norm())),
+        "sigmas": (error / result.cov[0].diagonal().sqrt()).tolist(),
     }
-    best = dict.fromkeys([*pictures, "map"], math.inf)
+
+
+def _time_ratio(scene: str, images: Sequence[PlantedMove], pin: CameraPin) -> dict[str, float]:
+    """Time of one image over that of one pair of the method ``map``, the least of alternating runs: plain and half
+    hidden."""
+    moved = next(frame for row, _, frame in images if row["kind"] == "shift")
+    hidden, _ = hide_behind_arms(moved, 0.5, arm_seed=1, draw=Random(f"{scene} time"))
+    calls: dict[str, Any] = {
+        "time_ratio": partial(pin.check, moved.image),
+        "time_ratio_half": partial(pin.check, hidden.image),
+        "map": partial(MAP, images[0][2], moved),
+    }
+    best = dict.fromkeys(calls, math.inf)
     for _ in range(_TIMED_RUNS):
-        for key, frame in pictures.items():
+        for key, call in calls.items():
             start = time.perf_counter()
-            pin.check(frame.image)
+            call()
             best[key] = min(best[key], time.perf_counter() - start)
-        start = time.perf_counter()
-        MAP(scene.reference, moved.frame)
-        best["map"] = min(best["map"], time.perf_counter() - start)
-    return {key: best[key] / best["map"] for key in pictures}
+    return {key: seconds / best["map"] for key, seconds in best.items() if key != "map"}
 
 
 def _real_rows(root: Path) -> list[Row]:
@@ -289,13 +271,9 @@ def _real_rows(root: Path) -> list[Row]:
                 low = float(results.shift_low_px.nanmedian())
                 turned = known & (results.T_ref_from_live.t.norm(dim=-1) == 0)
                 row: Row = {"scene": data, "pair": [0, len(recording) - 1], "method": against, "truth": None}
-                row |= {
-                    "note": f"episode {recording.episode}",
-                    "known": int(known.sum()),
-                    "moved": int(results.moved.sum()),
-                }
-                row |= {"low_px": None if math.isnan(low) else low, "turned": int(turned.sum())}
-                rows.append(row)
+                row |= {"note": f"episode {recording.episode}", "known": int(known.sum())}
+                row |= {"moved": int(results.moved.sum()), "low_px": None if math.isnan(low) else low}
+                rows.append(row | {"turned": int(turned.sum())})
     return rows
 
 

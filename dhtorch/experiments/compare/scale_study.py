@@ -43,12 +43,6 @@ from dhtorch.records import Frame
 from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.synthetic.recording import SyntheticRoom
 
-QUESTION = "Is the size right at three times the sensor's range, with a sigma that holds, and is a bent model refused?"
-EXPECTATION = (
-    "Error at three times the range <= 1 %; within 2 sigma >= 92 %; bent or drifting by >= 3 % refused >= 95 %, "
-)
-EXPECTATION += "sound refused <= 2 %."
-
 #: Number → (least, largest) value.
 SCALE_BARS: Bars = {
     "scale.far_error": (-math.inf, 0.01),
@@ -57,7 +51,6 @@ SCALE_BARS: Bars = {
     "scale.sound_refused": (-math.inf, 0.02),
 }
 
-_METRICS = tuple(MainMetric(name, larger_is_better=high == math.inf) for name, (_, high) in SCALE_BARS.items())
 
 #: Faults in the order of the rows: relative changes of scale that are planted, beside ``sound``.
 FAULTS = ("drift", "bend", "frames", "range", "region")
@@ -79,15 +72,6 @@ class ScaleScene(NamedTuple):
     poses: np.ndarray  # (F, 4, 4) camera to world
     depth: list[np.ndarray]  # (h, w) m, of every frame
     is_exact: bool  # whether ``depth`` is not the sensor's
-
-
-class ScaleNoise(NamedTuple):
-    """Noise of a model, standard deviations relative to depth unless said otherwise."""
-
-    white: float = 0.01  # of every pixel or point
-    smooth: float = 0.005  # of every quarter of a view's map
-    rotation_deg: float = 0.05
-    position: float = 0.002
 
 
 def run(
@@ -124,7 +108,9 @@ def run(
         max_frames: frames of a scene, evenly spread.
         progress: as for the main job.
     """
-    outcome = Outcome(metrics=_METRICS)
+    outcome = Outcome(
+        metrics=tuple(MainMetric(name, larger_is_better=high == math.inf) for name, (_, high) in SCALE_BARS.items())
+    )
     todo: list[tuple[str, Any, list[float]]] = []
     for scene in scenes_of(scenes):
         near = settings.cutoff_of(scene)
@@ -136,34 +122,32 @@ def run(
             todo.append((scene.name, scene, [near, near]))
     todo += [(f"room {seed}", seed, [room_near, room_fault_near]) for seed in rooms]
     for name, source, near_limits in progress(todo, "scale", len(todo)):
-        case = open_scale_room(source, room_frames) if isinstance(source, int) else _open(source, max_frames)
+        if isinstance(source, int):  # seen from so near that its far wall is at three times a sensor's range of 1.25 m
+            T = hand_held_path("walk", room_frames, step_m=0.08, rate_hz=30.0, seed=source)
+            T = T.replace(t=T.t + torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64))
+            room = SyntheticRoom(seed=source, n_frames=room_frames, hw=(180, 240), supersample=1, true_poses=T)
+        case = _open(Scene(room), room_frames) if isinstance(source, int) else _open(source, max_frames)
         outcome.rows += _study(name, case, near_limits, sizes, (sound, repeats), settings.seed)
         outcome.n_pairs += len(case.frames)
     outcome.summary = summarise_scales(outcome.rows)
-    return outcome.decide(QUESTION, EXPECTATION, *judge_bars(outcome.summary, SCALE_BARS))
+    return outcome.decide(
+        "Is the size right at three times the sensor's range, with a sigma that holds, and is a bent model refused?",
+        "Error at three times the range <= 1 %; within 2 sigma >= 92 %; bent or drifting by >= 3 % refused >= 95 %, "
+        "sound refused <= 2 %.",
+        *judge_bars(outcome.summary, SCALE_BARS),
+    )
 
 
 def _row(scene: str, kind: str, fault: str | None) -> Row:
     return {"scene": scene, "method": kind, "truth": fault or "sound", "pair": None, "role": None}
 
 
-def open_scale_room(seed: int, n_frames: int) -> ScaleScene:
-    """A built-in room seen from so near that its far wall is at three times a sensor's range of 1.25 m."""
-    T = hand_held_path("walk", n_frames, step_m=0.08, rate_hz=30.0, seed=seed)
-    T = T.replace(t=T.t + torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64))
-    room = SyntheticRoom(seed=seed, n_frames=n_frames, hw=(180, 240), supersample=1, true_poses=T)
-    return _open(Scene(room), n_frames)
-
-
 def _open(scene: Scene, max_frames: int) -> ScaleScene:
     recording = scene.recording
     chosen = spread_evenly(range(len(recording)), max_frames)
-    frames = [recording[i] for i in chosen]
-    exact = isinstance(recording, TruthRecording)
-    depth = []
+    frames, depth = [recording[i] for i in chosen], []
     for i, frame in zip(chosen, frames, strict=True):
-        h, w = (round(side * _MODEL_PX / max(frame.hw)) for side in frame.hw)
-        hw = h, w
+        hw = (round(frame.hw[0] * _MODEL_PX / max(frame.hw)), round(frame.hw[1] * _MODEL_PX / max(frame.hw)))
         uv = regular_grid_of(hw, frame.hw)
         if isinstance(recording, TruthRecording):
             z = sample_nearest(recording.truth(i)["depth"], uv)[0]
@@ -173,7 +157,7 @@ def _open(scene: Scene, max_frames: int) -> ScaleScene:
         depth.append(z.view(hw).double().numpy())
     assert recording.poses is not None
     poses = se3.to_matrix(recording.poses).numpy()[chosen]
-    return ScaleScene(frames, poses, depth, exact)
+    return ScaleScene(frames, poses, depth, isinstance(recording, TruthRecording))
 
 
 def regular_grid_of(hw: tuple[int, int], of: tuple[int, int]) -> torch.Tensor:
@@ -193,7 +177,10 @@ def make_scale_model(
     *,
     near: float,
     seed: int,
-    noise: ScaleNoise | None = None,
+    white: float = 0.01,
+    smooth: float = 0.005,
+    rotation_deg: float = 0.05,
+    position: float = 0.002,
 ) -> tuple[SceneModel, float]:
     """Scene -> (model up to scale with a planted fault, its true scale in metres per unit).
 
@@ -204,9 +191,9 @@ def make_scale_model(
         size: largest relative change of scale within the model.
         near: m, limit of the returns: a change with range is that over them, a region is one that they see.
         seed: of the noise, the similarity and the place of the fault.
-        noise: None = default.
+        white, smooth: noise of every pixel or point, and of every quarter of a view's map, relative to depth.
+        rotation_deg, position: noise of the poses, degrees and relative to the typical near depth.
     """
-    noise = noise or ScaleNoise()
     draw = np.random.default_rng(seed)
     F = len(scene.frames)
     gain = _frame_gains(F, fault, size, draw)
@@ -225,8 +212,8 @@ def make_scale_model(
         z = scene.depth[i] * gain[i]
         # a field of unit variance whose values a quarter of the map apart are independent
         coarse = torch.from_numpy(draw.normal(size=(1, 1, 5, 5)))
-        smooth = torch.nn.functional.interpolate(coarse, z.shape, mode="bilinear", align_corners=True)[0, 0].numpy()
-        z = z * np.exp(noise.smooth * smooth)
+        field = torch.nn.functional.interpolate(coarse, z.shape, mode="bilinear", align_corners=True)[0, 0].numpy()
+        z = z * np.exp(smooth * field)
         xyz = _unproject(frame, scene.depth[i]) @ scene.poses[i, :3, :3].T + scene.poses[i, :3, 3]
         if fault == "range":
             low, high = near_quantiles
@@ -234,23 +221,21 @@ def make_scale_model(
             z = z * np.exp(np.log1p(size) * along)
         if fault == "region":
             z = np.where(np.linalg.norm(xyz - centre, axis=-1) < radius, z * (1 + size), z)
-        turn = np.concatenate((np.radians(noise.rotation_deg) * draw.normal(size=3), np.zeros(3)))
+        turn = np.concatenate((np.radians(rotation_deg) * draw.normal(size=3), np.zeros(3)))
         poses[i, :3, :3] = poses[i, :3, :3] @ se3.exp(torch.from_numpy(turn)[None]).R[0].numpy()
-        poses[i, :3, 3] += noise.position * typical * draw.normal(size=3)
+        poses[i, :3, 3] += position * typical * draw.normal(size=3)
         clouds.append(z)
-    moved = similarity.move(poses)
-    K = [cam.to_matrix(frame.camera)[0].double().numpy() for frame in scene.frames]
-    lens = [None if f.camera.distortion is None else tuple(f.camera.distortion[0].tolist()) for f in scene.frames]
-    for i, frame in enumerate(scene.frames):
-        views.append(ModelView(f"{i:06d}", K[i], frame.hw, moved[i], lens[i]))
+    for i, (frame, c2w) in enumerate(zip(scene.frames, similarity.move(poses), strict=True)):
+        K, lens = cam.to_matrix(frame.camera)[0].double().numpy(), frame.camera.distortion
+        views.append(ModelView(f"{i:06d}", K, frame.hw, c2w, None if lens is None else tuple(lens[0].tolist())))
     if kind == "maps":
         maps = [
-            np.where(scene.depth[i] > 0, z * similarity.scale * np.exp(noise.white * draw.normal(size=z.shape)), 0.0)
+            np.where(scene.depth[i] > 0, z * similarity.scale * np.exp(white * draw.normal(size=z.shape)), 0.0)
             for i, z in enumerate(clouds)
         ]
         views = [ModelView(v.name, v.K, v.hw, v.c2w, v.distortion, depth=m) for v, m in zip(views, maps, strict=True)]
         return SceneModel(views), 1 / similarity.scale
-    return _observed_points(scene, views, clouds, similarity.scale, noise, draw), 1 / similarity.scale
+    return _observed_points(scene, views, clouds, similarity.scale, white, draw), 1 / similarity.scale
 
 
 def _observed_points(
@@ -258,7 +243,7 @@ def _observed_points(
     views: Sequence[ModelView],
     clouds: Sequence[np.ndarray],
     scale: float,
-    noise: ScaleNoise,
+    white: float,
     draw: np.random.Generator,
 ) -> SceneModel:
     """Model of points, each made in one view and observed in the views around it where it is not hidden."""
@@ -270,7 +255,7 @@ def _observed_points(
         there = np.nonzero(scene.depth[i].ravel() > 0)[0]
         there = draw.choice(there, min(_POINTS, len(there)), replace=False)
         local = _unproject(frame, clouds[i]).reshape(-1, 3)[there] * scale
-        local = local * np.exp(noise.white * draw.normal(size=(len(there), 1)))
+        local = local * np.exp(white * draw.normal(size=(len(there), 1)))
         xyz.append(local @ views[i].c2w[:3, :3].T + views[i].c2w[:3, 3])
         true = _unproject(frame, scene.depth[i]).reshape(-1, 3)[there]
         true = true @ scene.poses[i, :3, :3].T + scene.poses[i, :3, 3]
@@ -374,14 +359,16 @@ def measure_scale(scene: ScaleScene, kind: str, fault: str | None, size: float, 
     result = metric_scale(model, frames, names=names, sensor=sensor, cutoff=near)
     off = float(np.log(result.scale / true))
     own = np.log1p(error * result.terms["sensor"])
-    row: Row = {"refused": float(not result.ok), "scale_error": abs(off), "sigma": result.sigma}
-    row |= {"error_without_sensor": abs(off - float(own))}
-    row |= {"within_2sigma": float(abs(off) <= 2 * result.sigma), "within_sigma": float(abs(off) <= result.sigma)}
-    row |= {
+    return {
+        "refused": float(not result.ok),
+        "scale_error": abs(off),
+        "sigma": result.sigma,
+        "error_without_sensor": abs(off - float(own)),
+        "within_2sigma": float(abs(off) <= 2 * result.sigma),
+        "within_sigma": float(abs(off) <= result.sigma),
         "far_error": _far_error(scene, model, result.scale, near),
         "fault": str(result.faults[0]) if result.faults else "",
     }
-    return row
 
 
 def _far_error(scene: ScaleScene, model: SceneModel, scale: float, near: float) -> float | None:
@@ -417,12 +404,11 @@ def summarise_scales(rows: Sequence[Row]) -> Row:
     rows = [row for row in rows if "refused" in row]
     scenes = sorted({row["scene"] for row in rows})
 
-    def mean(key: str, keep: Any, weight: bool = True) -> Row:
+    def mean(key: str, keep: Any) -> Row:
         values = []
         for scene in scenes:
             here = [r for r in rows if r["scene"] == scene and keep(r) and r[key] is not None]
-            n = [r["n"] if weight else 1 for r in here]
-            values.append(float(np.average([r[key] for r in here], weights=n)) if here else None)
+            values.append(float(np.average([r[key] for r in here], weights=[r["n"] for r in here])) if here else None)
         return bootstrap.interval_over_scenes(values, statistic="mean").entry("1")
 
     def sound(row: Row) -> bool:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,18 +73,6 @@ def photometric_difference(depth: Tensor, reference: Frame, selected: dense.Sele
     return torch.where(visible, difference, torch.nan), torch.where(visible, state, State.CANNOT_KNOW).to(torch.int32)
 
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("called_right_wrong", larger_is_better=False),
-    MainMetric("called_wrong_right", larger_is_better=False),
-    MainMetric("false_alarm", larger_is_better=False),
-    MainMetric("scale_detected", larger_is_better=True),
-    MainMetric("jump_auroc", larger_is_better=True),
-)
-
-QUESTION = "Does validation detect the errors of a depth map, and report unknown where there is no evidence?"
-EXPECTATION = "Every number of the list of bars is met; scenes, and of causes windows, are the unit."
-
 #: Number → (least, largest) value.
 VALIDATE_BARS: Bars = {
     "validate.scale_detected": (0.95, math.inf),
@@ -133,38 +121,25 @@ _SCALE_COLUMN_SUFFIXES = {"scale": "", "scale_far": "_far", "quick_far": "_quick
 _PREDICTOR_PREFIXES = {"validate": "", "quick": "quick_", "photometric": "peer_"}
 
 
-@dataclass(frozen=True)
-class PlantedFault:
-    """A depth fault that all frames of a window share."""
-
-    kind: str | None  # as dhtorch.validation.faults names it; None = no fault
-    spoil: Callable[[Tensor], Tensor] = lambda depth: depth
-    lag: int = 0  # frames by which the maps lag behind the images
-    focal: float = 1.0  # factor on the stated focal lengths
-    ray: bool = False  # depth becomes the distance along the ray
-    in_sensor: bool = True  # planted in the sensor's own depth as well as in maps beside it
-
-
-_PLANTED_FAULTS: dict[str, PlantedFault] = {
-    "none": PlantedFault(None),
-    "unit_mm": PlantedFault("unit", partial(scale_depth, factor=1e3)),
-    "unit_m": PlantedFault("unit", partial(scale_depth, factor=1e-3)),
-    "unit_inch": PlantedFault("unit", partial(scale_depth, factor=1 / 0.0254)),
-    "mirrored": PlantedFault("mirrored", mirror_depth),
-    "upside_down": PlantedFault("mirrored", partial(torch.flip, dims=(-2,))),
-    "along_ray": PlantedFault("along the ray", ray=True),
-    "inverse": PlantedFault(
-        "inverse", lambda depth: torch.where(depth > 0, 3 / depth.clamp_min(1e-3), 0.0), in_sensor=False
-    ),
-    "rolled_90": PlantedFault("rolled", partial(faults.rot90_map, quarters=1)),
-    "rolled_180": PlantedFault("rolled", partial(faults.rot90_map, quarters=2)),
-    "wide": PlantedFault("registration", partial(rescale_field_of_view, factor=1 / 1.35)),
-    "narrow": PlantedFault("registration", partial(rescale_field_of_view, factor=1.2)),
-    "beside": PlantedFault("registration", partial(rescale_field_of_view, factor=1.0, right=-0.06)),
-    "late_3": PlantedFault("time offset", lag=3),
-    "early_4": PlantedFault("time offset", lag=-4),
-    "focal_long": PlantedFault("focal length", focal=1.06),
-    "focal_short": PlantedFault("focal length", focal=0.93),
+#: Fault → its kind, as dhtorch.validation.faults names it, and the options of :func:`_plant_fault`.
+_PLANTED_FAULTS: dict[str, tuple[str | None, dict[str, Any]]] = {
+    "none": (None, {}),
+    "unit_mm": ("unit", {"spoil": partial(scale_depth, factor=1e3)}),
+    "unit_m": ("unit", {"spoil": partial(scale_depth, factor=1e-3)}),
+    "unit_inch": ("unit", {"spoil": partial(scale_depth, factor=1 / 0.0254)}),
+    "mirrored": ("mirrored", {"spoil": mirror_depth}),
+    "upside_down": ("mirrored", {"spoil": partial(torch.flip, dims=(-2,))}),
+    "along_ray": ("along the ray", {"ray": True}),
+    "inverse": ("inverse", {"spoil": lambda depth: torch.where(depth > 0, 3 / depth.clamp_min(1e-3), 0.0)}),
+    "rolled_90": ("rolled", {"spoil": partial(faults.rot90_map, quarters=1)}),
+    "rolled_180": ("rolled", {"spoil": partial(faults.rot90_map, quarters=2)}),
+    "wide": ("registration", {"spoil": partial(rescale_field_of_view, factor=1 / 1.35)}),
+    "narrow": ("registration", {"spoil": partial(rescale_field_of_view, factor=1.2)}),
+    "beside": ("registration", {"spoil": partial(rescale_field_of_view, factor=1.0, right=-0.06)}),
+    "late_3": ("time offset", {"lag": 3}),
+    "early_4": ("time offset", {"lag": -4}),
+    "focal_long": ("focal length", {"focal": 1.06}),
+    "focal_short": ("focal length", {"focal": 0.93}),
 }
 
 
@@ -232,12 +207,15 @@ def run(
     ]
 
     def evaluate_scene(scene: Scene) -> Outcome:
-        load = partial(_load_frame, scene, settings)
-        reference_rows = []
-        count = min(len(scene.recording), reference_views)
-        spread = [(2 * k + 1) * len(scene.recording) // (2 * count) for k in range(count)]
-        for i in progress(spread, f"{scene.name}: reference views", reference_views):
-            reference_rows.append(_reference_row(scene, i, load, selecting_method, settings, size))
+        def load(i: int) -> Frame:
+            return scene.recording[i].to(settings.dtype).to(settings.device)
+
+        n = len(scene.recording)
+        count = min(n, reference_views)
+        spread = progress(
+            [(2 * k + 1) * n // (2 * count) for k in range(count)], f"{scene.name}: reference views", reference_views
+        )
+        reference_rows = [_reference_row(scene, i, load, selecting_method, settings, size) for i in spread]
         firsts = _first_frames(len(scene.recording), windows)
         window_rows = [
             r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, load)
@@ -245,12 +223,23 @@ def run(
         rows = [*reference_rows, *window_rows, _scene_row(scene, reference_rows)]
         return Outcome(rows, n_pairs=len(reference_rows))
 
-    outcome = Outcome(metrics=_METRICS)
-    keep = settings.finished.loop()
-    for scene in all_scenes:
-        outcome.add(keep(scene.name, partial(evaluate_scene, scene)))
+    outcome = settings.finished.run(
+        all_scenes,
+        evaluate_scene,
+        metrics=(
+            MainMetric("called_right_wrong", larger_is_better=False),
+            MainMetric("called_wrong_right", larger_is_better=False),
+            MainMetric("false_alarm", larger_is_better=False),
+            MainMetric("scale_detected", larger_is_better=True),
+            MainMetric("jump_auroc", larger_is_better=True),
+        ),
+    )
     outcome.summary = summarise_validation(outcome.rows)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+    return outcome.decide(
+        "Does validation detect the errors of a depth map, and report unknown where there is no evidence?",
+        "Every number of the list of bars is met; scenes, and of causes windows, are the unit.",
+        *verdict(outcome.summary),
+    )
 
 
 def summarise_validation(rows: Sequence[Row]) -> Row:
@@ -313,16 +302,9 @@ def _reference_row(
     sigma_rel = (selected.joined.sigma / selected.joined.depth)[hidden]
     n = int(hidden.sum())
     median = float(sigma_rel.median()) if n else None
-    row: Row = {
-        "scene": scene.name,
-        "pair": [i, i],
-        "method": "validate",
-        **{
-            "n_answers": n,
-            "stated": median,
-            "baseline": n >= _MIN_BASELINE_ANSWERS and median is not None and median <= _MAX_BASELINE_SIGMA_REL,
-        },
-    }
+    is_wide = n >= _MIN_BASELINE_ANSWERS and median is not None and median <= _MAX_BASELINE_SIGMA_REL
+    row: Row = {"scene": scene.name, "pair": [i, i], "method": "validate"}
+    row |= {"n_answers": n, "stated": median, "baseline": is_wide}
     for name, factor in {"none": 1.0, **_SCALE_FAULTS}.items():
         validation, quick = (check(true_map * factor, views=False) for check in (validate, validate_quick))
         scale = {"scale": validation.scale[0], "scale_far": validation.scale_far[0], "quick_far": quick.scale_far[0]}
@@ -489,42 +471,46 @@ def _window_rows(scene: Scene, first: int, load: Callable[[int], Frame]) -> list
     window_tracks = faults.track_window([frames_of[k] for k in range(first, first + _WINDOW_FRAMES)])
     rows = []
     for in_sensor in (True, False):
-        for name, planted in _PLANTED_FAULTS.items():
-            if in_sensor and not planted.in_sensor:
+        for name, (kind, options) in _PLANTED_FAULTS.items():
+            if in_sensor and name == "inverse":  # a fault of maps alone
                 continue
-            frames, maps = _plant_fault(scene, frames_of, first, planted, in_sensor)
+            frames, maps = _plant_fault(scene, frames_of, first, in_sensor, **options)
             diagnosis = faults.diagnose(frames, maps, watched=window_tracks)
-            motion_px = _fault_motion_px(frames, maps, frames_of, first, diagnosis.pairs) if planted.kind else 0.0
             row: Row = {"scene": scene.name, "pair": [first, first + _WINDOW_FRAMES - 1], "method": "causes"}
-            row |= {"source": "sensor" if in_sensor else "map", "fault": name, "planted_kind": planted.kind}
-            row |= {
-                "named": diagnosis.cause,
-                "named_kind": diagnosis.kind,
-                "moved_px": motion_px,
-                "n_diagnosed_pairs": diagnosis.n_pairs,
-            }
-            rows.append(row)
+            row |= {"source": "sensor" if in_sensor else "map", "fault": name, "planted_kind": kind}
+            row |= {"named": diagnosis.cause, "named_kind": diagnosis.kind}
+            row["moved_px"] = _fault_motion_px(frames, maps, frames_of, first, diagnosis.pairs) if kind else 0.0
+            rows.append(row | {"n_diagnosed_pairs": diagnosis.n_pairs})
     return rows
 
 
 def _plant_fault(
-    scene: Scene, frames_of: Mapping[int, Frame], first: int, fault: PlantedFault, in_sensor: bool
+    scene: Scene,
+    frames_of: Mapping[int, Frame],
+    first: int,
+    in_sensor: bool,
+    *,
+    spoil: Callable[[Tensor], Tensor] = lambda depth: depth,
+    lag: int = 0,  # frames by which the maps lag behind the images
+    focal: float = 1.0,  # factor on the stated focal lengths
+    ray: bool = False,  # depth becomes the distance along the ray
 ) -> tuple[list[Frame], list[Tensor] | None]:
+    """Frames of a window with a depth fault that all share, and the maps beside them if it is not in the sensor's."""
     faulty_frames, maps = [], []
     for k in range(first, first + _WINDOW_FRAMES):
-        source = frames_of[k - fault.lag]
-        depth = fault.spoil(source.depth)
-        camera = frames_of[k].camera.replace(f=frames_of[k].camera.f * fault.focal)
+        source = frames_of[k - lag]
+        depth = spoil(source.depth)
+        camera = frames_of[k].camera.replace(f=frames_of[k].camera.f * focal)
         depth_camera = frames_of[k].depth_camera
         if depth_camera is not None:
-            depth_camera = depth_camera.replace(f=depth_camera.f * fault.focal)
+            depth_camera = depth_camera.replace(f=depth_camera.f * focal)
         frame = frames_of[k].replace(camera=camera, depth_camera=depth_camera)
         image_depth = _depth_over_image(source)
-        if fault.ray:
+        if ray:
             depth = depth * _ray_lengths(source.depth_camera, source, depth)
             image_depth = image_depth * _ray_lengths(None, source, image_depth)
         faulty_frames.append(frame.replace(depth=depth) if in_sensor else range_split(frame, scene.near))
-        maps.append(fault.spoil(image_depth))
+        maps.append(spoil(image_depth))
     return faulty_frames, None if in_sensor else maps
 
 
@@ -575,10 +561,6 @@ def _fault_motion_px(
 
 
 # ------------------------------------------------------------------------------------------------------------- scenes
-
-
-def _load_frame(scene: Scene, settings: Settings, i: int) -> Frame:
-    return scene.recording[i].to(settings.dtype).to(settings.device)
 
 
 def _true_map(recording: Recording, i: int, full: Frame, size: int, method: Method) -> Tensor:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -125,63 +125,43 @@ def read(
         raise FormatError(root, "option per_scene", per_scene, "at least 1")
     raw = (root / "LightField").is_dir()
     locations, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root, per_scene)
-    locations = [location for location in locations if split in (None, location.split)]
+    locations = [location for location in locations if split in (None, location[1])]
     if not locations:
         raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
-    load = _StackLoader(tuple(locations), focus, constant)
-    names, scenes = (
-        tuple(column) for column in zip(*((location.name, location.scene) for location in locations), strict=True)
-    )
+    load = partial(_load_stack, locations, focus, constant)
+    names, _, scenes, *_ = zip(*locations, strict=True)
     return FocalStacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
 
 
-@dataclass(frozen=True, eq=False)
-class _StackLocation:
-    """Location of one stack: a row of an HDF5 array, or the file of a light field."""
-
-    name: str
-    split: str
-    scene: str
-    stack: Hdf5Array | Path
-    truth: Hdf5Array | Path | None
-    row: int = 0
+#: One stack: name, split, scene, row of an HDF5 array or file of a light field, its truth, and the row.
+_StackLocation = tuple[str, str, str, Hdf5Array | Path, Hdf5Array | Path | None, int]
 
 
-@dataclass(frozen=True, eq=False)
-class _StackLoader:
-    """Index → decoded stack."""
-
-    locations: tuple[_StackLocation, ...]
-    focus: Tensor  # (S,)
-    depth_disparity: float
-
-    def __call__(self, i: int) -> FocalStack:
-        location = self.locations[i]
-        if isinstance(location.stack, Path):
-            images = refocus(_light_field(location.stack), self.depth_disparity / self.focus.double())
-        else:
-            images = _as_images(location.stack.row(location.row), location.stack)
-        source, hw = _source_file(location.stack), (images.shape[-2], images.shape[-1])
-        if len(images) != len(self.focus):
-            raise FormatError(
-                _source_file(location.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
-            )
-        depth = None
-        if isinstance(location.truth, Path):
-            depth = torch.from_numpy(files.read_depth_png(location.truth, 1000.0, hw))[None]
-        elif location.truth is not None:
-            disparity = location.truth.row(location.row).astype(np.float64)
-            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
-            metres = np.where(usable, self.depth_disparity / np.where(usable, disparity, 1), 0)
-            depth = torch.from_numpy(metres.astype(np.float32))[None]
-        camera = convert.to_camera(convert.make_K(*_K), hw, source) if hw == _HW else None
-        return FocalStack(images[None], self.focus[None], depth, camera)
+def _load_stack(locations: Sequence[_StackLocation], focus: Tensor, depth_disparity: float, i: int) -> FocalStack:
+    """Index → decoded stack; focus distances (S,)."""
+    _, _, _, stack, truth, row = locations[i]
+    if isinstance(stack, Path):
+        images, source = refocus(_light_field(stack), depth_disparity / focus.double()), stack
+    else:
+        images, source = _as_images(stack.row(row), stack), stack.file
+    hw, depth = (images.shape[-2], images.shape[-1]), None
+    if len(images) != len(focus):
+        raise FormatError(source, "slices", len(images), f"{len(focus)}, one for each focus distance")
+    if isinstance(truth, Path):
+        depth = torch.from_numpy(files.read_depth_png(truth, 1000.0, hw))[None]
+    elif truth is not None:
+        disparity = truth.row(row).astype(np.float64)
+        usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
+        metres = np.where(usable, depth_disparity / np.where(usable, disparity, 1), 0)
+        depth = torch.from_numpy(metres.astype(np.float32))[None]
+    camera = convert.to_camera(convert.make_K(*_K), hw, source) if hw == _HW else None
+    return FocalStack(images[None], focus[None], depth, camera)
 
 
 def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation], list[str]]:
     """Stacks of the HDF5 files at ``root``, and an empty report."""
     sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
-    locations = []
+    locations: list[_StackLocation] = []
     for file in sources:
         arrays = list_hdf5_arrays(file)
         for key, stack in arrays.items():
@@ -196,13 +176,14 @@ def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation
                 raise FormatError(file, truth.key, f"shape {truth.shape}", f"{(n, *hw)}, as {key}")
             prefix = f"{file.stem}/{match[1]}" if len(sources) > 1 else match[1]
             rooms = [prefix if per_scene is None else f"{prefix}/scene_{i // per_scene:02d}" for i in range(n)]
-            locations += [_StackLocation(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
+            locations += [(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
     return locations, []
 
 
 def _light_fields(root: Path, depth_folder: str) -> tuple[list[_StackLocation], list[str]]:
     """Light fields below ``root``, and a report of those left out for a missing depth map."""
-    locations, report = [], []
+    locations: list[_StackLocation] = []
+    report = []
     for file in sorted((root / "LightField").glob("*/*/LF_*.npy")):
         scene = file.parent.relative_to(root / "LightField")
         number = file.stem.removeprefix("LF_")
@@ -213,7 +194,7 @@ def _light_fields(root: Path, depth_folder: str) -> tuple[list[_StackLocation], 
         else:
             label = truth if folder.is_dir() else None
             room = scene.as_posix()
-            locations.append(_StackLocation(f"{room}/{number}", scene.parts[0], room, file, label))
+            locations.append((f"{room}/{number}", scene.parts[0], room, file, label, 0))
     return locations, report
 
 
@@ -241,8 +222,3 @@ def _as_images(stack: np.ndarray, source: Hdf5Array) -> Tensor:
     if float(images.max()) <= 1.5:
         return images.clamp(max=1)
     return images.to(torch.uint8) if bool((images == images.round()).all()) else images / 255
-
-
-def _source_file(source: Hdf5Array | Path) -> Path:
-    """File of a stack's location."""
-    return source if isinstance(source, Path) else source.file

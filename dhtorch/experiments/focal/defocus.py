@@ -16,7 +16,8 @@ What would refute it: |rho| above 0.5, r with the oracle's side below 0.4, or a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,6 @@ from torch import Tensor
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.focal.blur import (
-    BlurMap,
     estimate_blur,
     guess_side_by_colour,
     guess_side_by_height,
@@ -47,19 +47,6 @@ from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
-
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("rho_abs", larger_is_better=True),
-    MainMetric("rank_corr", larger_is_better=True),
-    MainMetric("side_right", larger_is_better=True),
-    MainMetric("coverage", larger_is_better=True),
-)
-
-QUESTION = "How much depth is there in the defocus of a single picture?"
-EXPECTATION = (
-    "A weak signal, useful once an oracle gives the side of the focus, next to nothing when it has to be produced."
-)
 
 #: Variants that estimate the side of the focus.
 _DEPLOYABLE_SIDES = ("by_height", "by_colour", "all_beyond")
@@ -115,18 +102,17 @@ def run(
 
     Source: paper, "What Does Not Work", single-frame depth from defocus.
     """
-    optics = {"focal_length_m": focal_length_m, "f_number": f_number}
 
     def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
-        uv = _pixel_grid(frame.hw, stride_px, frame.camera.f)
-        if not has_exact_depth(scene.recording):
+        v, u = (torch.arange(stride_px // 2, side, stride_px).to(frame.camera.f) for side in frame.hw)
+        sites = _Sites(frame, torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2))
+        if not has_exact_depth(scene.recording):  # of unknown optics
             blur = estimate_blur(frame.image, noise=noise, window_px=window_px)
-            return {"natural": _correlate_unsigned(frame, uv, blur)}
-        lens = make_lens(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
-        return _measure_through_lens(
-            frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
-        )
+            return {"natural": {"rho_abs": sites.rho(blur.valid, blur.sigma)}}
+        lens = make_lens(float(frame.camera.f[0, 0]), focal_length_m=focal_length_m, f_number=f_number)
+        options: dict[str, Any] = {"noise": noise, "window_px": window_px, "seed": settings.seed}
+        return _measure_through_lens(frame, sites, lens.to(settings.dtype), colour=axial_colour_dpt, **options)
 
     outcome = screen_scenes(
         scenes_of(scenes),
@@ -134,14 +120,26 @@ def run(
         evaluate_item,
         VARIANTS,
         truth="full",
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("rho_abs", larger_is_better=True),
+            MainMetric("rank_corr", larger_is_better=True),
+            MainMetric("side_right", larger_is_better=True),
+            MainMetric("coverage", larger_is_better=True),
+        ),
         finished=settings.finished,
         progress=progress,
     )
     outcome.summary |= {
         k: bootstrap.without_interval(v, 1) for k, v in measure_ambiguities(noise=noise, window_px=window_px).items()
     }
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "How much depth is there in the defocus of a single picture?",
+        (
+            "A weak signal, useful once an oracle gives the side of the focus, next to nothing when it has to "
+            "be produced."
+        ),
+        *verdict(outcome),
+    )
 
 
 def has_exact_depth(recording: Recording) -> bool:
@@ -210,7 +208,7 @@ def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int
 
 
 def _measure_through_lens(
-    frame: Frame, uv: Tensor, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
+    frame: Frame, sites: _Sites, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
 ) -> dict[str, Row]:
     """Variant → row of one image, rendered with the focus on the depth at its centre."""
     depth, (h, w) = frame.depth, frame.hw
@@ -234,16 +232,16 @@ def _measure_through_lens(
         "by_colour": guess_side_by_colour(image, window_px=window_px, noise=noise) if colour else None,
         "all_beyond": torch.ones_like(spot),
     }
-    sites = _Sites(frame, uv)
     rows = {}
     for name, side in sides.items():
         if side is not None:
             estimate = inverse_depth_from_blur(blur, side, lens, focus)
-            rows[name] = sites.correlations(blur.valid & (side != 0), estimate, blur.sigma)
-            rows[name] |= {"side_right": sites.fraction(blur.valid & (side != 0), side == true_side)}
-            rows[name] |= {"blur_corr": sites.correlate(blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs())}
-            rows[name] |= {"texture_corr": sites.correlate(blur.valid & pinhole.valid, blur.sigma, pinhole.sigma)}
-            rows[name] |= {"rho_perfect": sites.rho(blur.valid, spot.abs())}
+            rows[name] = sites.correlations(blur.valid & (side != 0), estimate, blur.sigma) | {
+                "side_right": sites.fraction(blur.valid & (side != 0), side == true_side),
+                "blur_corr": sites.correlate(pearson, blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs()),
+                "texture_corr": sites.correlate(pearson, blur.valid & pinhole.valid, blur.sigma, pinhole.sigma),
+                "rho_perfect": sites.rho(blur.valid, spot.abs()),
+            }
     rows["height_alone"] = sites.correlations(blur.valid, -row_up, row_up)
     rows["texture_alone"] = sites.correlations(pinhole.valid, -pinhole.sigma, pinhole.sigma)
     return rows
@@ -257,57 +255,34 @@ class _Sites:
         self.index = (uv[0, :, 1].long(), uv[0, :, 0].long())
         self.candidate, self.depth = truth.ok[0], truth.depth[0].double()
 
-    def at(self, x: Tensor) -> Tensor:
-        """Values (N,) of a map (1, H, W)."""
-        return x[0][self.index]
-
     def correlations(self, valid: Tensor, estimate: Tensor, blur: Tensor) -> Row:
         """Row of correlations of estimated inverse depth (1, H, W) and of blur with true inverse depth."""
-        kept = self.candidate & self.at(valid)
-        enough = int(kept.sum()) >= _MIN_CORRELATION_SITES
-        n = int(self.candidate.sum())
-        x, y = self.at(estimate)[kept].double(), 1 / self.depth[kept]
+        n, n_kept = int(self.candidate.sum()), int((self.candidate & valid[0][self.index]).sum())
         return {
             "n_candidates": n,
-            "n_kept": int(kept.sum()),
-            "coverage": int(kept.sum()) / n if n else None,
+            "n_kept": n_kept,
+            "coverage": n_kept / n if n else None,
             "rho_abs": self.rho(valid, blur),
-            "corr": pearson(x, y) if enough else None,
-            "rank_corr": spearman(x, y) if enough else None,
+            "corr": self.correlate(pearson, valid, estimate),
+            "rank_corr": self.correlate(spearman, valid, estimate),
         }
 
     def rho(self, valid: Tensor, x: Tensor) -> float | None:
         """|Spearman| of a map with true inverse depth; None with too few pixels."""
-        kept = self.candidate & self.at(valid)
-        correlation = (
-            spearman(self.at(x)[kept].double(), 1 / self.depth[kept])
-            if int(kept.sum()) >= _MIN_CORRELATION_SITES
-            else None
-        )
+        correlation = self.correlate(spearman, valid, x)
         return None if correlation is None else abs(correlation)
 
-    def correlate(self, valid: Tensor, x: Tensor, y: Tensor) -> float | None:
-        """Pearson's r of two maps; None with too few pixels."""
-        kept = self.candidate & self.at(valid)
-        return (
-            pearson(self.at(x)[kept].double(), self.at(y)[kept].double())
-            if int(kept.sum()) >= _MIN_CORRELATION_SITES
-            else None
-        )
+    def correlate(
+        self, statistic: Callable[..., float | None], valid: Tensor, x: Tensor, y: Tensor | None = None
+    ) -> float | None:
+        """Correlation of a map with another, or with true inverse depth; None with too few pixels."""
+        kept = self.candidate & valid[0][self.index]
+        if int(kept.sum()) < _MIN_CORRELATION_SITES:
+            return None
+        other = 1 / self.depth[kept] if y is None else y[0][self.index][kept].double()
+        return statistic(x[0][self.index][kept].double(), other)
 
     def fraction(self, valid: Tensor, mask: Tensor) -> float | None:
         """Fraction of the valid candidates where a mask is True."""
-        kept = self.candidate & self.at(valid)
-        return float(self.at(mask)[kept].double().mean()) if bool(kept.any()) else None
-
-
-def _correlate_unsigned(frame: Frame, uv: Tensor, blur: BlurMap) -> Row:
-    """Row of an image with unknown optics: |Spearman| of blur and inverse depth."""
-    return {"rho_abs": _Sites(frame, uv).rho(blur.valid, blur.sigma)}
-
-
-def _pixel_grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
-    """Pixel coordinates (1, N, 2) of a grid with the given stride."""
-    v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
-    u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2)
+        kept = self.candidate & valid[0][self.index]
+        return float(mask[0][self.index][kept].double().mean()) if bool(kept.any()) else None

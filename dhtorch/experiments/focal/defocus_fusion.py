@@ -16,7 +16,6 @@ never lower, and not higher in the median either.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,19 +38,7 @@ from dhtorch.experiments.protocol import (
 )
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import pearson
-from dhtorch.records import Frame
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
-
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("mean_rel", larger_is_better=False),
-    MainMetric("median_rel", larger_is_better=False),
-    MainMetric("edge_mean_rel", larger_is_better=False),
-    MainMetric("rmse_m", larger_is_better=False),
-)
-
-QUESTION = "Does defocus help to fill in between the returns of a depth sensor?"
-EXPECTATION = "No: plain interpolation is hard to beat, and defocus raises its error slightly."
 
 VARIANTS = ("bilinear", "joint_bilateral", "guided_filter", "defocus_guided", "defocus_bold", "defocus_bilateral")
 
@@ -114,7 +101,11 @@ def run(
         image, return_noise = frame.image, 0.0
         if has_exact_depth(scene.recording):
             lens = make_lens(float(frame.camera.f[0, 0]), focal_length_m=focal_length_m, f_number=f_number)
-            image, return_noise = _render_through_lens(frame, lens.to(settings.dtype), noise, generator), sensor_noise
+            # through the lens with the focus on the depth at the centre, with pixel noise
+            focus = frame.depth[:, frame.hw[0] // 2, frame.hw[1] // 2, None]
+            shot = render_defocus(image, frame.depth, lens.to(settings.dtype), focus, step_px=1.0)[:, 0]
+            image = (shot + noise * torch.randn(shot.shape, generator=generator).to(shot)).clamp(0, 1)
+            return_noise = sensor_noise
         return _evaluate_frame(image, frame.depth, factor, return_noise, noise, generator)
 
     outcome = screen_scenes(
@@ -123,12 +114,21 @@ def run(
         evaluate_item,
         VARIANTS,
         truth="left_out",
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("mean_rel", larger_is_better=False),
+            MainMetric("median_rel", larger_is_better=False),
+            MainMetric("edge_mean_rel", larger_is_better=False),
+            MainMetric("rmse_m", larger_is_better=False),
+        ),
         finished=settings.finished,
         progress=progress,
     )
     _add_ratios(outcome)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does defocus help to fill in between the returns of a depth sensor?",
+        "No: plain interpolation is hard to beat, and defocus raises its error slightly.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
@@ -156,13 +156,6 @@ def thin_returns(depth: Tensor, factor: int) -> tuple[Tensor, Tensor]:
     h, w = depth.shape[-2] // factor, depth.shape[-1] // factor
     cropped = depth[..., : h * factor, : w * factor]
     return cropped[..., factor // 2 :: factor, factor // 2 :: factor], cropped
-
-
-def _render_through_lens(frame: Frame, lens: Any, noise: float, generator: torch.Generator) -> Tensor:
-    """Image rendered through the lens with the focus on the depth at its centre, with pixel noise."""
-    h, w = frame.hw
-    image = render_defocus(frame.image, frame.depth, lens, frame.depth[:, h // 2, w // 2, None], step_px=1.0)[:, 0]
-    return (image + noise * torch.randn(image.shape, generator=generator).to(image)).clamp(0, 1)
 
 
 def _evaluate_frame(
@@ -219,8 +212,7 @@ def _add_ratios(outcome: Outcome) -> None:
     for name in VARIANTS[1:]:
         ratios = []
         for scene, row in outcome.scenes(name, "left_out").items():
-            error = row.get("mean_rel")
-            baseline = plain.get(scene, {}).get("mean_rel")
+            error, baseline = row.get("mean_rel"), plain.get(scene, {}).get("mean_rel")
             if error is not None and baseline:
                 row["mean_rel_ratio"] = error / baseline
                 ratios.append(error / baseline)

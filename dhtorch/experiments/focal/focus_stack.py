@@ -45,17 +45,6 @@ from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("rank_corr", larger_is_better=True),
-    MainMetric("corr", larger_is_better=True),
-    MainMetric("gated_rank_corr", larger_is_better=True),
-    MainMetric("flip_share", larger_is_better=False),
-)
-
-QUESTION = "Does the classical method, the sharpest picture of every pixel, recover depth from a focal stack?"
-EXPECTATION = "On clean stacks; on light fields it fails, flips sign on some scenes, and confidence does not rescue it."
-
 RENDERED_CONDITIONS = ("clean", "noisy", "moved", "aligned", "light_field", "no_focus")
 _RECORDED_CONDITIONS = ("given", "given_aligned")
 
@@ -126,34 +115,49 @@ def run(
     """
     if slices < 2:
         raise ValueError(f"experiment.slices: found {slices}, expected at least 2")
-    evaluate = partial(_evaluate_depth, measures=measures, window_px=window_px, stride=stride_px)
+
+    def evaluate_stack(conditions: Mapping[str, Tensor], focus_m: Tensor, depth: Tensor) -> dict[str, Row]:
+        evaluate = partial(_evaluate_depth, focus_m=focus_m, depth=depth, window_px=window_px, stride=stride_px)
+        return {
+            condition if m == measures[0] else f"{condition}, {m}": evaluate(images, measure=m)
+            for condition, images in conditions.items()
+            for m in measures
+        }
 
     def evaluate_item(scene: _StackRoom | Scene, item: ScreenedItem) -> dict[str, Row]:
         if isinstance(scene, _StackRoom):
-            stack = _sort_by_focus(scene.stacks[item[0]].to(settings.dtype).to(settings.device))
+            stack = scene.stacks[item[0]].to(settings.dtype).to(settings.device)
             if stack.depth is None or stack.focus_m is None:
-                return measure_without_truth(stack, measures[0], window_px)
-            conditions = {"given": stack.images, "given_aligned": align_stack(stack.images)[0]}
-            return _evaluate_stack(conditions, stack.focus_m, stack.depth, evaluate, measures)
+                order = slice(None) if stack.focus_m is None else stack.focus_m[0].argsort()
+                return measure_without_truth(stack.replace(images=stack.images[:, order]), measures[0], window_px)
+            order = stack.focus_m[0].argsort()  # from near to far
+            images = stack.images[:, order]
+            conditions = {"given": images, "given_aligned": align_stack(images)[0]}
+            return evaluate_stack(conditions, stack.focus_m[:, order], stack.depth)
         frame = scene.recording[0].to(settings.dtype).to(settings.device)
         steps = torch.linspace(1 / _FOCUS_RANGE_M[0], 1 / _FOCUS_RANGE_M[1], slices, dtype=settings.dtype)
         lens = {"focal_length_m": focal_length_m, "f_number": f_number}
-        rendered = render_stacks(frame, 1 / steps[None], lens, settings.seed)
-        return _evaluate_stack(rendered, 1 / steps[None], frame.depth, evaluate, measures)
+        return evaluate_stack(render_stacks(frame, 1 / steps[None], lens, settings.seed), 1 / steps[None], frame.depth)
 
     rooms = [room for source in scenes for room in _group_rooms(source, max_stacks)]
     names = [
         c if m == measures[0] else f"{c}, {m}" for c in (*RENDERED_CONDITIONS, *_RECORDED_CONDITIONS) for m in measures
     ]
-    variants = _possible_variants(rooms, names)
+    kinds = {isinstance(room, _StackRoom) for room in rooms}
+    variants = [n for n in names if (n.split(",")[0] in _RECORDED_CONDITIONS) in kinds]
     outcome = screen_scenes(
         rooms,
-        _stack_items,
+        lambda room: [(i, i) for i in room.indices] if isinstance(room, _StackRoom) else [(0, 0)],
         evaluate_item,
         variants,
         truth="full",
         whole=_flip_shares,
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("rank_corr", larger_is_better=True),
+            MainMetric("corr", larger_is_better=True),
+            MainMetric("gated_rank_corr", larger_is_better=True),
+            MainMetric("flip_share", larger_is_better=False),
+        ),
         finished=settings.finished,
         progress=progress,
     )
@@ -161,7 +165,11 @@ def run(
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]
         entry = bootstrap.interval_over_scenes(flips, statistic="mean").entry()
         outcome.summary |= {f"{name}.flip_share": entry} if entry["value"] is not None else {}
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does the classical method, the sharpest picture of every pixel, recover depth from a focal stack?",
+        "On clean stacks; on light fields it fails, flips sign on some scenes, and confidence does not rescue it.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
@@ -290,24 +298,12 @@ def halves_correlation(measured: Tensor) -> float | None:
     return spearman(odd.place.flatten()[kept].double(), even.place.flatten()[kept].double())
 
 
-def _evaluate_stack(
-    conditions: Mapping[str, Tensor], focus_m: Tensor, depth: Tensor, evaluate: Any, measures: Sequence[str]
-) -> Any:
-    """Evaluate every condition with every measure: variant → row."""
-    return {
-        condition if m == measures[0] else f"{condition}, {m}": evaluate(images, focus_m, depth, measure=m)
-        for condition, images in conditions.items()
-        for m in measures
-    }
-
-
 def _evaluate_depth(
     images: Tensor,
+    *,
     focus_m: Tensor,
     depth: Tensor,
-    *,
     measure: str,
-    measures: Sequence[str],
     window_px: float,
     stride: int,
 ) -> Row:
@@ -338,17 +334,11 @@ def _evaluate_depth(
     }
 
 
-def _stack_items(scene: _StackRoom | Scene) -> list[ScreenedItem]:
-    """The stacks of a scene; the first frame of a recording."""
-    return [(i, i) for i in scene.indices] if isinstance(scene, _StackRoom) else [(0, 0)]
-
-
 def _flip_shares(_scene: _StackRoom | Scene, results: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
     """Variant → fraction of a scene's stacks with a negative correlation: a mean, as a median would be 0 or 1."""
     flips: dict[str, list[float]] = {}
-    for rows in results:
-        for variant, row in rows.items():
-            flips.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
+    for variant, row in (item for rows in results for item in rows.items()):
+        flips.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
     return {variant: {"flip_share": mean_or_none(values)} for variant, values in flips.items() if values}
 
 
@@ -358,7 +348,9 @@ def _group_rooms(source: FocalStacks | SceneLike, most: int) -> list[_StackRoom 
         selected = set(torch.linspace(0, len(source) - 1, min(most, len(source))).round().int().tolist())
         rooms = {s: tuple(i for i in indices if i in selected) for s, indices in source.by_scene().items()}
         single = len(source) == 1
-        label = source.name if source.root is None or not single else _folder_name(source)
+        # a folder of images; the path of its last three parts if the name is only a number
+        parts = source.root.resolve().parts[-3:] if single and source.root else (source.name,)
+        label = "/".join(parts) if parts[-1].isdecimal() and len(parts) > 1 else parts[-1]
         return [
             _StackRoom(label if single else f"{label}/{s}", source, stacks) for s, stacks in rooms.items() if stacks
         ]
@@ -366,23 +358,3 @@ def _group_rooms(source: FocalStacks | SceneLike, most: int) -> list[_StackRoom 
     if not has_exact_depth(scene.recording):
         raise ValueError(f"focus_stack: found {scene.name}, expected focal stacks or a recording with exact depth")
     return [scene]
-
-
-def _folder_name(stacks: FocalStacks) -> str:
-    """Name of a folder of images; the path of its last three parts if the name is only a number."""
-    parts = stacks.root.resolve().parts[-3:] if stacks.root else (stacks.name,)
-    return parts[-1] if not parts[-1].isdecimal() else "/".join(parts)
-
-
-def _possible_variants(scenes: Sequence[_StackRoom | Scene], names: Sequence[str]) -> list[str]:
-    """Subset of the variants ``names`` that applies to the kinds of the scenes."""
-    kinds = {isinstance(s, _StackRoom) for s in scenes}
-    return [n for n in names if (n.split(",")[0] in _RECORDED_CONDITIONS) in kinds]
-
-
-def _sort_by_focus(stack: FocalStack) -> FocalStack:
-    """Stack sorted from near to far focus; unchanged without focus distances."""
-    if stack.focus_m is None:
-        return stack
-    order = stack.focus_m[0].argsort()
-    return stack.replace(images=stack.images[:, order], focus_m=stack.focus_m[:, order])

@@ -16,7 +16,7 @@ What would refute it: over the scenes, the median r of ``own_arm`` reaches half 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -184,16 +184,6 @@ def _normalised_correlation(template: Tensor, search: Tensor) -> tuple[Tensor, T
     ]
 
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("corr", larger_is_better=True),
-    MainMetric("rank_corr", larger_is_better=True),
-    MainMetric("coverage", larger_is_better=True),
-)
-
-QUESTION = "Does the correlation of the two spiral signals in time measure parallax?"
-EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flow does; forward motion is not seen."
-
 VARIANTS = ("own_arm", "between_arms", "best_arm", "flow", "flow_along_arm")
 
 #: Smallest number of sites for a correlation.
@@ -272,11 +262,19 @@ def run(
         evaluate_item,
         VARIANTS,
         truth="full",
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("corr", larger_is_better=True),
+            MainMetric("rank_corr", larger_is_better=True),
+            MainMetric("coverage", larger_is_better=True),
+        ),
         finished=settings.finished,
         progress=progress,
     )
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does the correlation of the two spiral signals in time measure parallax?",
+        "No: its shifts hardly correlate with inverse depth, plain 2-D flow does; forward motion is not seen.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
@@ -387,8 +385,7 @@ def _correlate_arms(
 
     The search is centred on the point of the same direction from the image centre.
     """
-    site = sites[a]
-    target = site
+    site = target = sites[a]
     if a != b:
         target = torch.searchsorted(arms[b].turn, arms[a].turn[site] + step).clamp_max(len(arms[b].turn) - 1)
     shift: ArmShift = correlate(signals[0][a], signals[1][b], site[None], target[None])
@@ -406,11 +403,9 @@ def _correlation_row(
     own = candidate & answered
     shared = own & common
 
-    def over(mask: Tensor, statistic: Any) -> float | None:
-        x = shift[mask].double()
-        y = 1 / depth[mask].double()
-        correlation: float | None = statistic(x, y) if x.numel() >= _MIN_CORRELATION_SITES else None
-        return correlation
+    def over(mask: Tensor, statistic: Callable[[Tensor, Tensor], float | None]) -> float | None:
+        enough = int(mask.sum()) >= _MIN_CORRELATION_SITES
+        return statistic(shift[mask].double(), 1 / depth[mask].double()) if enough else None
 
     n, moving = int(candidate.sum()), shared & (flow > _MIN_FLOW_PX)
     return {

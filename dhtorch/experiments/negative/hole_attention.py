@@ -131,17 +131,6 @@ def _label_clusters(nearest: Tensor, hole: Tensor) -> Tensor:
     return label
 
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("hole_rate", larger_is_better=None),
-    MainMetric("cluster_share", larger_is_better=True),
-    MainMetric("cluster_returns", larger_is_better=True),
-    MainMetric("rise", larger_is_better=True),
-)
-
-QUESTION = "Does denser sampling at the holes fill them?"
-EXPECTATION = "No: the hole rate rises; the classes of the holes say what could fill them."
-
 VARIANTS = ("centre", "attention", "random", "even")
 _TRUTH = "sensor"
 
@@ -191,11 +180,15 @@ def run(
         before = classify_frame(method, frame)
         hole = before.hole != Hole.NONE
         cluster = largest_cluster(before.uv, hole, neighbours=neighbours)
+        # a random pixel in the central nine tenths of the image
+        generator = torch.Generator().manual_seed(settings.seed + 1000 * (item[0] + 1))
+        relative = 0.05 + 0.9 * torch.rand(2, generator=generator)
+        random_gaze = relative * torch.tensor([frame.hw[1] - 1.0, frame.hw[0] - 1.0])
         samples = {
             "centre": before,
-            "random": classify_frame(_with_gaze(method, _random_gaze(frame.hw, settings.seed, item[0])), frame),
+            "random": classify_frame(_with_gaze(method, random_gaze), frame),
+            "even": classify_frame(method.replace(sample=vogel_spiral), frame),
         }
-        samples["even"] = classify_frame(method.replace(sample=vogel_spiral), frame)
         if bool(hole.any()):
             samples["attention"] = classify_frame(_with_gaze(method, cluster.gaze[0]), frame)
         return {v: _count_holes(samples[v], before, cluster, frame.hw) for v in VARIANTS if v in samples}
@@ -206,11 +199,20 @@ def run(
         evaluate_item,
         VARIANTS,
         truth=_TRUTH,
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("hole_rate", larger_is_better=None),
+            MainMetric("cluster_share", larger_is_better=True),
+            MainMetric("cluster_returns", larger_is_better=True),
+            MainMetric("rise", larger_is_better=True),
+        ),
         finished=settings.finished,
         progress=progress,
     )
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does denser sampling at the holes fill them?",
+        "No: the hole rate rises; the classes of the holes say what could fill them.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
@@ -232,30 +234,19 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 
 def _with_gaze(method: Method, gaze: Tensor) -> Method:
     """Method whose sampler has its gaze at a pixel."""
-    u, v = gaze.tolist()
-    return method.replace(sample={"gaze": (u, v)})
-
-
-def _random_gaze(hw: tuple[int, int], seed: int, i: int) -> Tensor:
-    """Random pixel (2,) in the central nine tenths of an image."""
-    generator = torch.Generator().manual_seed(seed + 1000 * (i + 1))
-    relative = 0.05 + 0.9 * torch.rand(2, generator=generator)
-    return relative * torch.tensor([hw[1] - 1.0, hw[0] - 1.0])
+    return method.replace(sample={"gaze": tuple(gaze.tolist())})
 
 
 def _count_holes(samples: Samples, before: Samples, cluster: Cluster, hw: tuple[int, int]) -> Row:
     """Row of one sampling: hole counts, and its returns inside the cluster of the first sampling."""
-    row = count_holes(samples)
-    rate_before = float((before.hole != Hole.NONE).float().mean())
-    nearest = torch.cdist(samples.uv, before.uv).argmin(-1)
-    inside = cluster.member.gather(1, nearest)
+    row, was_hole = count_holes(samples), before.hole != Hole.NONE
+    inside = cluster.member.gather(1, torch.cdist(samples.uv, before.uv).argmin(-1))
     returned = inside & (samples.hole == Hole.NONE)
-    n = int(inside.sum())
-    n_holes = int((before.hole != Hole.NONE).sum())
+    n, n_holes = int(inside.sum()), int(was_hole.sum())
     centre = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2]).to(cluster.gaze)
     distance = float((cluster.gaze[0] - centre).norm())
     return row | {
-        "rise": row["hole_rate"] - rate_before,
+        "rise": row["hole_rate"] - float(was_hole.float().mean()),
         "cluster_share": int(cluster.n[0]) / n_holes if n_holes else None,
         "gaze_way_px": distance if n_holes else None,
         "n_in_cluster": n,

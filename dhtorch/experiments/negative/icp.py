@@ -236,17 +236,6 @@ def _move_invalid_away(xyz: Tensor, valid: Tensor, far: float) -> Tensor:
     return torch.where(valid[..., None], xyz, far)
 
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("rotation_deg", larger_is_better=False),
-    MainMetric("translation_m", larger_is_better=False),
-    MainMetric("n_voxels", larger_is_better=True),
-    MainMetric("drift_rel", larger_is_better=False),
-)
-
-QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
-EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
-
 ICP_POSE_SOURCES = ("good", "poor", "none")
 _SOLVERS = ("", " + icp points", " + icp planes")
 VARIANTS = tuple(source + solver for source in ICP_POSE_SOURCES for solver in _SOLVERS)
@@ -334,11 +323,20 @@ def run(
         VARIANTS,
         truth=_TRUTH,
         whole=whole,
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("rotation_deg", larger_is_better=False),
+            MainMetric("translation_m", larger_is_better=False),
+            MainMetric("n_voxels", larger_is_better=True),
+            MainMetric("drift_rel", larger_is_better=False),
+        ),
         finished=settings.finished,
         progress=progress,
     )
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does ICP between independently sampled sparse sets add anything to a good device pose?",
+        "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:

@@ -13,14 +13,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.outcome import join_outcomes
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant, stage_key
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_progress,
+    run_protocol,
+    stage_key,
+)
 from dhtorch.metrics import bootstrap
 from dhtorch.stages.sample import regular_grid, vogel_spiral
-
-QUESTION = "Which part of the method determines the result?"
-EXPECTATION = "No change of a single part lowers the median error by more than a tenth."
 
 
 def run(
@@ -33,7 +40,7 @@ def run(
     windows: Sequence[int] = (15, 31),
     others: Mapping[str, Method] | None = None,
     wholes: Mapping[str, Method] | None = None,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Error ratios of single changes on the range split: sampler, number of samples, tracker, method, cutoff.
 
@@ -69,8 +76,8 @@ def run(
                 changed[f"+ {stage} of {other}"] = method.replace(**{stage: theirs})
                 changed[f"- {stage} of {other}"] = whole.replace(**{stage: ours})
     variants = {k: Variant(m) for k, m in changed.items()}
-    main = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
-    half_cutoff = protocol.run(
+    main = run_protocol(scenes, Protocol(variants), pairs, settings, progress=progress)
+    half_cutoff = run_protocol(
         scenes,
         Protocol({"cutoff x0.5": Variant(method)}),
         pairs,
@@ -82,7 +89,11 @@ def run(
     ratios = {k: _error_ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
         outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.without_interval(value, count)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict({k: ratios[k][0] for k in judged[1:]}))
+    return outcome.decide(
+        "Which part of the method determines the result?",
+        "No change of a single part lowers the median error by more than a tenth.",
+        *verdict({k: ratios[k][0] for k in judged[1:]}),
+    )
 
 
 def verdict(ratios: Mapping[str, float | None]) -> tuple[bool | None, str]:

@@ -9,17 +9,22 @@ answers (no order), or the expected calibration error is at most 0.1 (calibrated
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, hide_nothing
 from dhtorch.experiments.outcome import Row, join_outcomes, summarise_rows
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.metrics import bootstrap, errors, reliability, risk
-
-QUESTION = "Does the score order answers by risk, and is it a probability?"
-EXPECTATION = "It orders (AURC below the mean risk) without being calibrated (ECE above 0.1)."
 
 
 def run(
@@ -29,7 +34,7 @@ def run(
     settings: Settings,
     *,
     thresholds: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Reliability, risk–coverage and risk at thresholds of every method, on the range split and on the hold-out.
 
@@ -45,21 +50,29 @@ def run(
     Source: paper, "Calibration" and the figure on selective risk–coverage.
     """
     range_protocol = Protocol({name: Variant(m) for name, m in methods.items()}, reads_scores=True)
-    parts = [protocol.run(scenes, range_protocol, pairs, settings, progress=progress)]
+    parts = [run_protocol(scenes, range_protocol, pairs, settings, progress=progress)]
     for name, method in methods.items():
         heldout = HeldOut(method, settings)
         cohorts = {"heldout": heldout.heldout}
         heldout_protocol = Protocol({name: heldout.variant()}, cohorts, hide_nothing, reads_scores=True)
-        parts.append(protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress))
+        parts.append(run_protocol(scenes, heldout_protocol, pairs, settings, progress=progress))
     outcome = join_outcomes(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
         if row["pair"] is None and key in outcome.points:
             row.update(_at_thresholds(outcome.points[key], thresholds))
     outcome.summary = summarise_rows(outcome.rows, list(methods), ["heldout", *settings.truth])
+    with_role = {r["scene"] for r in outcome.rows if r.get("role")}
     for name in methods:
-        outcome.summary |= _pooled(outcome, name)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
+        points = outcome.points.items()
+        own = [p for (s, m, t), p in points if (m, t) == (name, outcome.cohort) and s not in with_role]
+        ece = reliability.measure_reliability(own)["ece"]
+        outcome.summary[f"{name}.ece_pooled"] = bootstrap.without_interval(ece, len(own))
+    return outcome.decide(
+        "Does the score order answers by risk, and is it a probability?",
+        "It orders (AURC below the mean risk) without being calibrated (ECE above 0.1).",
+        *verdict(outcome, next(iter(methods))),
+    )
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
@@ -85,11 +98,3 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
         metrics = errors.measure_errors(above)
         row[f"at_{threshold:g}"] = {k: metrics[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel")}
     return row
-
-
-def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
-    with_role = {r["scene"] for r in outcome.rows if r.get("role")}
-    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, outcome.cohort) and s not in with_role]
-    return {
-        f"{method}.ece_pooled": bootstrap.without_interval(reliability.measure_reliability(scenes)["ece"], len(scenes))
-    }

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from dhtorch.data.scene import SceneLike, scenes_of
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import (
     HeldOut,
     hide_nothing,
@@ -24,11 +23,18 @@ from dhtorch.experiments.cohorts import (
     trajectory_pose_fit,
 )
 from dhtorch.experiments.outcome import Row
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
+from dhtorch.experiments.protocol import (
+    Answer,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.geometry import se3
-
-QUESTION = "Is the device's own trajectory good enough to triangulate with?"
-EXPECTATION = "No: depth correlates with truth better, and errs less, under the anchored pose."
 
 
 def run(
@@ -37,7 +43,7 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors of held-out samples triangulated under the device's trajectory, raw and converted, and under ours.
 
@@ -57,8 +63,12 @@ def run(
         "anchored": split.variant(),
     }
     heldout_protocol = Protocol(variants, {"heldout": split.heldout}, hide_nothing, _trajectory_disagreement)
-    outcome = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    outcome = run_protocol(scenes, heldout_protocol, pairs, settings, progress=progress)
+    return outcome.decide(
+        "Is the device's own trajectory good enough to triangulate with?",
+        "No: depth correlates with truth better, and errs less, under the anchored pose.",
+        *verdict(outcome),
+    )
 
 
 def _trajectory_disagreement(answer: Answer) -> Row:

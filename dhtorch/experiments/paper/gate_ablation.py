@@ -15,13 +15,19 @@ from typing import Any
 
 from dhtorch.data.pairs import Pair, by_gap, by_scaled_gap
 from dhtorch.data.scene import Scene, SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, hide_nothing
 from dhtorch.experiments.outcome import join_outcomes
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings
-
-QUESTION = "Which gate carries the abstention, and how does the frame gap trade error for coverage?"
-EXPECTATION = "Without the parallax gate correlation falls by more than without the reprojection gate."
+from dhtorch.experiments.protocol import (
+    Answer,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    no_progress,
+    run_protocol,
+)
 
 GapPairs = dict[str, Callable[[Any], list[Pair]]]
 
@@ -34,7 +40,7 @@ def run(
     *,
     factors: Sequence[float] = (0.5, 2.0),
     gaps: Sequence[int] = (),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Hold-out errors with each gate off, and at other frame gaps.
 
@@ -60,12 +66,16 @@ def run(
     for name, options in gate_options.items():
         variant = split.variant()
         variants[name] = replace(variant, method=variant.method.replace(triangulate=options))
-    main = protocol.run(
+    main = run_protocol(
         scenes, Protocol(variants, {"heldout": split.heldout}, hide_nothing), pairs, settings, progress=progress
     )
     parts = [main, *sweep_gaps(scenes, split, pairs_at_gaps(factors, gaps), settings, progress)]
     outcome = join_outcomes(parts)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+    return outcome.decide(
+        "Which gate carries the abstention, and how does the frame gap trade error for coverage?",
+        "Without the parallax gate correlation falls by more than without the reprojection gate.",
+        *verdict(outcome.summary),
+    )
 
 
 def pairs_at_gaps(factors: Sequence[float], gaps: Sequence[int]) -> GapPairs:
@@ -80,13 +90,13 @@ def sweep_gaps(
     gaps: GapPairs,
     settings: Settings,
     progress: Progress,
-    columns: Callable[[protocol.Answer], dict[str, Any]] = protocol.no_columns,
+    columns: Callable[[Answer], dict[str, Any]] = lambda _answer: {},
 ) -> list[Outcome]:
     """Outcomes of the hold-out, one per gap."""
     parts = []
     for name, pairs in gaps.items():
         heldout_protocol = Protocol({name: split.variant()}, {"heldout": split.heldout}, hide_nothing, columns)
-        part = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
+        part = run_protocol(scenes, heldout_protocol, pairs, settings, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     return parts

@@ -49,17 +49,6 @@ from dhtorch.integrate.recording import (
 )
 from dhtorch.metrics import bootstrap
 
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("n_voxels", larger_is_better=True),
-    MainMetric("right_share", larger_is_better=True),
-    MainMetric("n_islands", larger_is_better=False),
-    MainMetric("n_fragments", larger_is_better=False),
-)
-
-QUESTION = "Does fusing recovered points into one map extend it, and do they connect its fragments?"
-EXPECTATION = "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands."
-
 MAP_TRUTH = "whole sensor"
 VARIANTS = tuple(f"{what} {poses}" for poses in POSE_SOURCES for what in ("sensor", "fused"))
 
@@ -131,11 +120,20 @@ def run(
         VARIANTS,
         truth=MAP_TRUTH,
         whole=whole,
-        metrics=_METRICS,
+        metrics=(
+            MainMetric("n_voxels", larger_is_better=True),
+            MainMetric("right_share", larger_is_better=True),
+            MainMetric("n_islands", larger_is_better=False),
+            MainMetric("n_fragments", larger_is_better=False),
+        ),
         finished=settings.finished,
         progress=progress,
     )
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does fusing recovered points into one map extend it, and do they connect its fragments?",
+        "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands.",
+        *verdict(outcome),
+    )
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:

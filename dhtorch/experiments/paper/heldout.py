@@ -17,16 +17,20 @@ from typing import Any
 import torch
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, hide_nothing
 from dhtorch.experiments.outcome import Row, join_outcomes
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
-from dhtorch.metrics import bootstrap
-
-QUESTION = "How accurate is triangulated depth, scene by scene, at points that the pose was not fitted to?"
-EXPECTATION = (
-    "The hold-out error is five times that on the pose's own inliers; half of the scenes pass the strict line."
+from dhtorch.experiments.protocol import (
+    Answer,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    no_progress,
+    run_protocol,
 )
+from dhtorch.metrics import bootstrap
 
 #: Hold-out error over that of the naive protocol. Source: paper.
 _PUBLISHED_RATIO = 5.0
@@ -50,7 +54,7 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors on half B of the returns with the pose from half A, and naively on the inliers of that pose.
 
@@ -67,11 +71,20 @@ def run(
         cohorts = {"cyclic": split.cyclic, "heldout": split.heldout}
         columns = partial(recovery_columns, split)
         heldout_protocol = Protocol({name: split.variant()}, cohorts, hide_nothing, columns, reads_scores=True)
-        part = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
-        part.summary |= {f"{name}.{k}": v for k, v in _mark_passes(part.rows, name).items()}
+        part = run_protocol(scenes, heldout_protocol, pairs, settings, progress=progress)
+        scene_rows = [r for r in part.rows if r["pair"] is None and (r["method"], r["truth"]) == (name, "heldout")]
+        for row in scene_rows:
+            row["passes"] = passes_strict_line(row)
+        counted = [row["passes"] for row in scene_rows if row["role"] is None]
+        for key, value in (("n_passes", sum(counted)), ("n_scenes", len(counted))):
+            part.summary[f"{name}.{key}"] = bootstrap.without_interval(value, len(counted), "count")
         parts.append(part)
     outcome = join_outcomes(parts)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
+    return outcome.decide(
+        "How accurate is triangulated depth, scene by scene, at points that the pose was not fitted to?",
+        ("The hold-out error is five times that on the pose's own inliers; half of the scenes pass the strict line."),
+        *verdict(outcome, next(iter(methods))),
+    )
 
 
 def recovery_columns(split: HeldOut, answer: Answer) -> Row:
@@ -82,9 +95,8 @@ def recovery_columns(split: HeldOut, answer: Answer) -> Row:
     returns = whole.depth[~hole]
     columns: Row = {"n_holes": int(hole.sum()), "n_recovered": recovered.numel()}
     for name, depths in (("reach", recovered), ("returns", returns)):
-        defined = depths.numel() > 0
-        columns[f"{name}_p95_m"] = float(depths.double().quantile(0.95)) if defined else None
-        columns[f"{name}_max_m"] = float(depths.max()) if defined else None
+        columns[f"{name}_p95_m"] = float(depths.double().quantile(0.95)) if depths.numel() else None
+        columns[f"{name}_max_m"] = float(depths.max()) if depths.numel() else None
     return columns
 
 
@@ -95,16 +107,6 @@ def passes_strict_line(row: Mapping[str, Any]) -> bool:
         return False
     corr, median_rel, residual_px = (float(v) for v in numbers if v is not None)
     return corr > _MIN_CORR and median_rel < _MAX_MEDIAN_REL and residual_px < _MAX_RESIDUAL_PX
-
-
-def _mark_passes(rows: Sequence[Row], method: str) -> dict[str, Any]:
-    """Set ``passes`` in the held-out scene rows → number of scenes that pass, and number of scenes."""
-    scene_rows = [r for r in rows if r["pair"] is None and (r["method"], r["truth"]) == (method, "heldout")]
-    for row in scene_rows:
-        row["passes"] = passes_strict_line(row)
-    counted = [r for r in scene_rows if r["role"] is None]
-    values = {"n_passes": sum(r["passes"] for r in counted), "n_scenes": len(counted)}
-    return {k: bootstrap.without_interval(v, len(counted), "count") for k, v in values.items()}
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:

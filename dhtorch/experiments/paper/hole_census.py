@@ -9,7 +9,6 @@ is below a tenth of that of samples with a return.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -20,17 +19,6 @@ from dhtorch.experiments.outcome import MainMetric, Row, mean_or_none, median_or
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.metrics import errors
 from dhtorch.records import Samples
-
-#: Main metrics of the experiment.
-_METRICS = (
-    MainMetric("hole_rate", larger_is_better=None),
-    MainMetric("hole_share.trackable_no_lidar", larger_is_better=None),
-    MainMetric("trackability_hole", larger_is_better=None),
-    MainMetric("trackability_valid", larger_is_better=None),
-)
-
-QUESTION = "Are most of the sensor's holes trackable in the picture?"
-EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackability like that of samples with a return."
 
 
 def run(
@@ -67,15 +55,25 @@ def run(
             rows[-1] |= count_holes(classify_frame(method, recording[i].to(settings.dtype).to(settings.device)))
         return Outcome([*rows, _join_frames(rows, scene)], n_pairs=len(rows))
 
-    outcome = Outcome(metrics=_METRICS)
-    keep = settings.finished.loop()
-    for scene in scenes_of(scenes):
-        outcome.add(keep(scene.name, partial(count_scene, scene)))
+    outcome = settings.finished.run(
+        scenes_of(scenes),
+        count_scene,
+        metrics=(
+            MainMetric("hole_rate", larger_is_better=None),
+            MainMetric("hole_share.trackable_no_lidar", larger_is_better=None),
+            MainMetric("trackability_hole", larger_is_better=None),
+            MainMetric("trackability_valid", larger_is_better=None),
+        ),
+    )
     scene_rows = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
     outcome.summary = errors.summarise_scenes(
         [{k: v for k, v in r.items() if k not in ("pair", "role")} for r in scene_rows]
     )
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+    return outcome.decide(
+        "Are most of the sensor's holes trackable in the picture?",
+        "At least half of the holes are TRACKABLE_NO_LIDAR, of trackability like that of samples with a return.",
+        *verdict(outcome.summary),
+    )
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
@@ -115,8 +113,7 @@ def count_holes(samples: Samples) -> Row:
 def _join_frames(rows: Sequence[Row], scene: Scene) -> Row:
     """Rows of frames → scene row: sums of counts, mean ratios over frames with holes, median trackability."""
     row: Row = {"scene": scene.name, "pair": None, "method": rows[0]["method"], "truth": None}
-    row |= {"role": scene.role, "n_pairs": len(rows)}
-    row |= {k: sum(r[k] for r in rows) for k in ("n_samples", "n_holes")}
+    row |= {"role": scene.role, "n_pairs": len(rows)} | {k: sum(r[k] for r in rows) for k in ("n_samples", "n_holes")}
     row["hole_rate"] = row["n_holes"] / max(row["n_samples"], 1)
     for group in ("hole_share", "route_share"):
         with_holes = [r[group] for r in rows if r["n_holes"]]

@@ -24,12 +24,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dhtorch.data.pairs import to_fixed_pairs
-from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import memory
 from dhtorch.experiments.baselines import dinov2 as visual
 from dhtorch.experiments.outcome import MainMetric, Row
@@ -39,12 +40,6 @@ from dhtorch.metrics import holdout
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Estimate, Frame, Samples
-
-QUESTION = "What does the method cost beside a DINOv2-L forward pass, and how does it grow with the image?"
-EXPECTATION = (
-    "A DINOv2-L forward takes at least 96 times as long as the front end at 224x224, and the front end grows at most "
-    "3.4 times to 1440x1920."
-)
 
 #: The paper's figures (Apple M4 Pro, OpenCV on 14 threads): times in ms, and two ratios to compare on any machine.
 _PAPER_FIGURES = {
@@ -130,7 +125,14 @@ def run(
     name, method = next(iter(chosen.items()))
     scene = scenes_of(scenes)[0]
     options: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
-    views = _first_pair(scene, pairs, settings)
+    fixed = to_fixed_pairs(pairs(scene))
+    if not fixed:
+        raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
+    near, cutoff = (
+        (scene.recording[k].to(settings.dtype).to(settings.device) for k in fixed[0]),
+        settings.cutoff_of(scene),
+    )
+    views = [holdout.range_split(view, cutoff) for view in near]
     branches: list[TimedBranch] = []
     for hw in sizes:
         frame_0, frame_1 = (_resample_frame(view, (hw[0], hw[1])) for view in views)
@@ -152,7 +154,14 @@ def run(
     named = dict.fromkeys(f"{b.stage}.{'x'.join(map(str, b.hw))}" for b in branches)
     metrics = tuple(MainMetric(stage, larger_is_better=False, with_interval=True) for stage in named)
     outcome = Outcome(rows=rows, summary=summarise_timings(branches), n_pairs=1, metrics=metrics)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(name, outcome.summary, sizes, note))
+    return outcome.decide(
+        "What does the method cost beside a DINOv2-L forward pass, and how does it grow with the image?",
+        (
+            "A DINOv2-L forward takes at least 96 times as long as the front end at 224x224, and the front end "
+            "grows at most 3.4 times to 1440x1920."
+        ),
+        *verdict(name, outcome.summary, sizes, note),
+    )
 
 
 def run_front_end(method: Method, frame: Frame, n: int) -> Samples:
@@ -192,16 +201,6 @@ def verdict(
         claims.append(True if worst >= limit else False if best < limit else None)
         parts.append(f"{label} {entry['value']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}), paper {paper:.3g}")
     return False if False in claims else None if None in claims else True, "; ".join(parts)
-
-
-def _first_pair(scene: Scene, pairs: ScenePairs, settings: Settings) -> tuple[Frame, Frame]:
-    """First pair of a scene, with returns beyond the cutoff hidden."""
-    chosen = to_fixed_pairs(pairs(scene))
-    if not chosen:
-        raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
-    cutoff = settings.cutoff_of(scene)
-    reference, other = (scene.recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
-    return holdout.range_split(reference, cutoff), holdout.range_split(other, cutoff)
 
 
 def _resample_frame(frame: Frame, hw: tuple[int, int]) -> Frame:
@@ -250,24 +249,28 @@ def _time_round(branch: TimedBranch, warm_up: int, device: str) -> None:
             stages = branch.call()
             if device != "cpu":
                 torch.cuda.synchronize(device)
-            total = 1e3 * (time.perf_counter() - start)
-            if k < 0:
-                continue
-            times[branch.stage].append(total)
-            if device == "cpu":  # on other devices a stage returns before it is done
-                for stage, ms in stages.items() if isinstance(stages, dict) else ():
-                    times.setdefault(stage, []).append(ms)
+            measured = {branch.stage: 1e3 * (time.perf_counter() - start)}
+            if device == "cpu" and isinstance(stages, dict):  # on other devices a stage returns before it is done
+                measured |= stages
+            for stage, ms in measured.items() if k >= 0 else ():
+                times.setdefault(stage, []).append(ms)
     branch.rounds.append(times)
 
 
 def _timing_row(scene: str, branch: TimedBranch, stage: str, settings: Settings, n: int) -> Row:
     """Row of one branch or stage at one size."""
-    times = sorted(branch.times(stage))
+    times = branch.times(stage)
     row: Row = {"scene": scene, "pair": None, "method": branch.method, "stage": stage, "hw": list(branch.hw)}
     row |= {"n": None if branch.method == VISUAL_BRANCH else n, "repeats": len(times)}
-    row |= {"threads": torch.get_num_threads(), "device": settings.device, **_describe_machine()}
+    cpu = ""
+    with contextlib.suppress(OSError):
+        lines = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
+        cpu = lines[0].partition(":")[2].strip() if lines else ""
+    row |= {"threads": torch.get_num_threads(), "device": settings.device}
+    row |= {"cpu": cpu or platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    row["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # runnable processes, last minute
     for name, (quantile, min_repeats) in _TAIL_PERCENTILES.items():
-        row[name] = percentile(times, quantile) if len(times) >= min_repeats else None
+        row[name] = float(np.quantile(times, quantile)) if len(times) >= min_repeats else None
     row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
     return row | branch.more if stage == branch.stage else row
 
@@ -279,9 +282,9 @@ def summarise_timings(branches: Sequence[TimedBranch]) -> dict[str, Any]:
     for b in branches:
         size = "x".join(map(str, b.hw))
         for stage in b.rounds[0]:
-            medians = b.medians(stage)
-            median = statistics.median(b.times(stage))
-            summary[f"{b.method}.{stage}.{size}"] = _summary_entry(median, medians, len(b.times(stage)), "ms")
+            times = b.times(stage)
+            entry = _summary_entry(statistics.median(times), b.medians(stage), len(times), "ms")
+            summary[f"{b.method}.{stage}.{size}"] = entry
         if b.more["peak_mib"] is not None:
             summary[f"{b.method}.{b.stage}.{size}.peak_mib"] = _summary_entry(b.more["peak_mib"], [], 1, "MiB")
     for b in (front[0], *(b for b in branches if b.method == VISUAL_BRANCH)):
@@ -299,20 +302,3 @@ def summarise_timings(branches: Sequence[TimedBranch]) -> dict[str, Any]:
 def _summary_entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
     low, high = (min(spread), max(spread)) if spread else (None, None)
     return Interval(value, low, high, n).entry(unit)
-
-
-def _describe_machine() -> Row:
-    """Processor, number of cores, and load (runnable processes, last minute)."""
-    name = ""
-    with contextlib.suppress(OSError):
-        lines = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
-        name = lines[0].partition(":")[2].strip() if lines else ""
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {"cpu": name or platform.processor() or platform.machine(), "cores": os.cpu_count(), "load": load}
-
-
-def percentile(ordered: Sequence[float], share: float) -> float:
-    """Percentile with linear interpolation of sorted numbers."""
-    position = share * (len(ordered) - 1)
-    low = int(position)
-    return ordered[low] + (position - low) * (ordered[min(low + 1, len(ordered) - 1)] - ordered[low])

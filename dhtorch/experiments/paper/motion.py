@@ -15,17 +15,13 @@ from functools import partial
 import torch
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut
 from dhtorch.experiments.outcome import Row, join_outcomes
 from dhtorch.experiments.paper.gate_ablation import pairs_at_gaps, sweep_gaps
 from dhtorch.experiments.paper.heldout import recovery_columns
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, ScenePairs, Settings
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import spearman
-
-QUESTION = "Does recovery depend on the translational baseline?"
-EXPECTATION = "With a longer baseline more holes are recovered, and answers err less."
 
 
 def run(
@@ -35,7 +31,7 @@ def run(
     settings: Settings,
     *,
     factors: Sequence[float] = (0.25, 0.5, 1.0, 2.0),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Rank correlation of recovery and error with the baseline, from the hold-out at several frame gaps.
 
@@ -55,11 +51,19 @@ def run(
     parts = sweep_gaps(scenes, split, pairs_at_gaps(factors, ()), settings, progress, partial(_baseline_columns, split))
     outcome = join_outcomes(parts)
     for name in dict.fromkeys(r["scene"] for r in outcome.rows):
-        trend = _baseline_trend([r for r in outcome.rows if r["scene"] == name and r["pair"] is not None])
+        pair_rows = [r for r in outcome.rows if r["scene"] == name and r["pair"] is not None]
+        trend = {
+            "rank_corr_recovered": _spearman(pair_rows, "recovered_share"),
+            "rank_corr_error": _spearman(pair_rows, "median_rel"),
+        }
         for row in outcome.rows:
             if row["scene"] == name and row["pair"] is None:
                 row.update(trend)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(
+        "Does recovery depend on the translational baseline?",
+        "With a longer baseline more holes are recovered, and answers err less.",
+        *verdict(outcome),
+    )
 
 
 def _baseline_columns(split: HeldOut, answer: Answer) -> Row:
@@ -82,13 +86,6 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
         f"rank correlation with the baseline, median over {recovered.n} scenes: recovered share "
         f"{recovered.value:+.2f}, error {error.value:+.2f}"
     )
-
-
-def _baseline_trend(rows: Sequence[Row]) -> Row:
-    return {
-        "rank_corr_recovered": _spearman(rows, "recovered_share"),
-        "rank_corr_error": _spearman(rows, "median_rel"),
-    }
 
 
 def _spearman(rows: Sequence[Row], metric: str) -> float | None:

@@ -19,7 +19,6 @@ import torch
 
 from dhtorch.codes import Gate
 from dhtorch.data.scene import SceneLike, scenes_of
-from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.cohorts import (
     far_real_holes,
@@ -28,7 +27,20 @@ from dhtorch.experiments.cohorts import (
     trajectory_pose_fit,
 )
 from dhtorch.experiments.outcome import Row, join_outcomes
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Answer,
+    Cohort,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    held_back_truth,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.geometry import se3
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Estimate, Frame
@@ -70,12 +82,6 @@ def sensor_only(
     return estimate
 
 
-QUESTION = "Can near returns alone recover far depth, and is the pose from near returns the cause?"
-EXPECTATION = (
-    "The gated method answers at least a quarter of the far candidates on the median scene, with an error below that "
-    "of triangulation from the device's raw trajectory; the gates lower p90."
-)
-
 #: Options of the triangulation stage that switch off the paper's two gates.
 NO_GATES = {"min_parallax_deg": None, "max_residual_px": None}
 
@@ -88,7 +94,7 @@ def run(
     *,
     cutoff_factors: Sequence[float] = (0.75, 1.25),
     cutoffs: Sequence[float] = (),
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors and coverage of five estimates of far depth on one cohort, and of the gated one at other cutoffs.
 
@@ -122,17 +128,17 @@ def run(
         "gated": Variant(method),
     }
     test = settings.truth[-1]
-    cohorts: dict[str, protocol.Cohort] = {test: partial(protocol.held_back_truth, test=test)}
+    cohorts: dict[str, Cohort] = {test: partial(held_back_truth, test=test)}
     if any(missing_truth_reason(scene) is None for scene in scenes_of(scenes)):
         cohorts = {"real_holes": partial(far_real_holes, test=test), **cohorts}
     main_protocol = Protocol(variants, cohorts, columns=_truth_columns)
-    main = protocol.run(scenes, main_protocol, pairs, settings, progress=progress)
+    main = run_protocol(scenes, main_protocol, pairs, settings, progress=progress)
     require_no_returns(main.rows, test)
     sweep = {f"gated, cutoff x{f:g}": replace(settings, cutoff_factor=f) for f in cutoff_factors}
     sweep |= {f"gated, cutoff {c:g} m": replace(settings, cutoff=c, cutoff_factor=1.0) for c in cutoffs}
     parts = [main]
     for name, cutoff_settings in sweep.items():
-        part = protocol.run(
+        part = run_protocol(
             scenes,
             Protocol({name: Variant(method)}, {test: cohorts[test]}, columns=_truth_columns),
             pairs,
@@ -142,7 +148,14 @@ def run(
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     outcome = join_outcomes(parts)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+    return outcome.decide(
+        "Can near returns alone recover far depth, and is the pose from near returns the cause?",
+        (
+            "The gated method answers at least a quarter of the far candidates on the median scene, with an "
+            "error below that of triangulation from the device's raw trajectory; the gates lower p90."
+        ),
+        *verdict(outcome.summary),
+    )
 
 
 def require_no_returns(rows: Sequence[Row], cohort: str) -> None:

@@ -11,13 +11,20 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from dhtorch.data.scene import SceneLike
-from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import missing_truth_reason, real_holes
 from dhtorch.experiments.paper.range_split import NO_GATES
-from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
-
-QUESTION = "Are the sensor's real holes recovered as well as hidden returns?"
-EXPECTATION = "No: on the median scene the error on real holes is larger, and some scenes have no answer."
+from dhtorch.experiments.protocol import (
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    held_back_truth,
+    no_progress,
+    run_protocol,
+)
 
 
 def run(
@@ -26,7 +33,7 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Errors with and without gates on the sensor's own drop-outs and on hidden far returns.
 
@@ -43,10 +50,14 @@ def run(
         "gated": Variant(method, needs=missing_truth_reason),
     }
     test = settings.truth[-1]
-    cohorts = {test: partial(protocol.held_back_truth, test=test), "real_holes": partial(real_holes, test=test)}
+    cohorts = {test: partial(held_back_truth, test=test), "real_holes": partial(real_holes, test=test)}
     hole_protocol = Protocol(variants, cohorts, min_candidates=1)
-    outcome = protocol.run(scenes, hole_protocol, pairs, settings, progress=progress)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, test))
+    outcome = run_protocol(scenes, hole_protocol, pairs, settings, progress=progress)
+    return outcome.decide(
+        "Are the sensor's real holes recovered as well as hidden returns?",
+        "No: on the median scene the error on real holes is larger, and some scenes have no answer.",
+        *verdict(outcome, test),
+    )
 
 
 def verdict(outcome: Outcome, hidden_cohort: str = "full") -> tuple[bool | None, str]:

@@ -50,9 +50,6 @@ from dhtorch.experiments.probes.probing import (
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.geometry import se3
 
-QUESTION = "Do the recovered depths of an enriched data set help a linear policy predict the camera's next motion?"
-EXPECTATION = "Yes: beside DINOv2, the error is smaller than with the sensor's returns alone."
-
 #: What is held out at a time, as the rows of the result name it.
 BLOCKS_OUT, STREAMS_OUT = "blocks held out", "streams held out"
 
@@ -113,9 +110,7 @@ def run(
         ImportError: ``transformers`` is missing; the message says what to install.
         ValueError: a scene that is no LeRobot set or has no poses, or fewer than three blocks or streams.
     """
-    networks, origin = front_ends.load_network_front_ends(
-        dinov2, cells=dinov2_cells, xfeat_too=False, efficientnet_too=False, device=settings.device
-    )
+    networks, origin = front_ends.load_network_front_ends(dinov2, cells=dinov2_cells, device=settings.device)
     extract = partial(extract_features, readings=readings, networks=networks, settings=settings, cells=depth_cells)
     outcome = Outcome(metrics=PROBE_METRICS)
     samples = [(s, split_into_samples(s, gap_parts, blocks, min_samples)) for s in scenes_of(scenes)]
@@ -138,7 +133,9 @@ def run(
         outcome.n_pairs = by_block.n
     outcome.summary = probing.summarise_probes(errors_by_split[BLOCKS_OUT])
     return outcome.decide(
-        QUESTION, EXPECTATION, *verdict(errors_by_split[BLOCKS_OUT], errors_by_split[STREAMS_OUT], origin)
+        "Do the recovered depths of an enriched data set help a linear policy predict the camera's next motion?",
+        "Yes: beside DINOv2, the error is smaller than with the sensor's returns alone.",
+        *verdict(errors_by_split[BLOCKS_OUT], errors_by_split[STREAMS_OUT], origin),
     )
 
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from dhtorch.data.scene import Scene
 from dhtorch.experiments.baselines import dinov2, efficientnet, xfeat
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
@@ -131,94 +130,70 @@ class DepthTokens:
         return pool_tokens(added["tokens"], added["tokens_valid"], self.patches, self.cells).float(), added
 
 
-class PatchTokens:
-    """DINOv2 features: class token, and patch tokens averaged over ``cells`` × ``cells`` parts of the image."""
-
-    def __init__(self, network: torch.nn.Module, *, cells: int = 1, side: int = 224) -> None:
-        self.network, self.cells, self.side = network, cells, side
-
-    @torch.no_grad()
-    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
-        """Features (B, (1 + cells²) · hidden), by one forward pass."""
-        image = dinov2.preprocess_image(torch.cat([f.image for f in frames]), self.side)
-        tokens = self.network(pixel_values=image.float()).last_hidden_state
-        patches = tokens[:, 1 + dinov2.register_count(self.network) :]
-        side = round(patches.shape[1] ** 0.5)
-        coarse = torch.nn.functional.adaptive_avg_pool2d(patches.mT.unflatten(-1, (side, side)), self.cells)
-        return torch.cat((tokens[:, 0], coarse.flatten(1)), 1).float()
-
-
-class DenseFeatures:
-    """XFeat features: unit-length descriptors averaged over ``cells`` × ``cells`` parts of the image."""
-
-    def __init__(self, network: torch.nn.Module, *, cells: int = 2, longest_px: int = 640) -> None:
-        self.network, self.cells, self.longest_px = network, cells, longest_px
-
-    @torch.no_grad()
-    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
-        """Features (B, cells² · 64)."""
-        image = torch.cat([f.image for f in frames])
-        features = xfeat.extract_xfeat(self.network, image, scale=1.0, longest_px=self.longest_px)
-        return torch.stack(
-            [torch.nn.functional.adaptive_avg_pool2d(f.D, self.cells).flatten() for f in features]
-        ).float()
+@torch.no_grad()
+def patch_tokens(
+    network: torch.nn.Module,
+    frames: Sequence[Frame],
+    others: Sequence[Frame] | None = None,
+    *,
+    cells: int = 1,
+    side: int = 224,
+) -> Tensor:
+    """DINOv2 features (B, (1 + cells²) · hidden), by one forward pass: class token, and patch tokens averaged over
+    ``cells`` × ``cells`` parts of the image."""
+    image = dinov2.preprocess_image(torch.cat([f.image for f in frames]), side)
+    tokens = network(pixel_values=image.float()).last_hidden_state
+    patches = tokens[:, 1 + dinov2.register_count(network) :]
+    n = round(patches.shape[1] ** 0.5)
+    coarse = torch.nn.functional.adaptive_avg_pool2d(patches.mT.unflatten(-1, (n, n)), cells)
+    return torch.cat((tokens[:, 0], coarse.flatten(1)), 1).float()
 
 
-def load_visual_front_end(
-    build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str
-) -> tuple[PatchTokens | None, str | None]:
-    """The DINOv2 front end of the settings (None = left out), and the origin of its weights; None = random weights.
-
-    Args:
-        build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load_dinov2`; None = leave it out.
-        cells, device: of the front end.
-
-    Raises:
-        ImportError: ``transformers`` is missing; the message says what to install.
-        FormatError: the weights are not those of one DINOv2 network.
-    """
-    if build is None:
-        return None, None
-    options = getattr(build, "keywords", {})
-    network = build().to(device)
-    front_end = PatchTokens(network, cells=cells, side=options.get("side", 224))
-    return front_end, None if options.get("weights") is None else dinov2.describe_weights(network)
+@torch.no_grad()
+def dense_features(
+    network: torch.nn.Module,
+    frames: Sequence[Frame],
+    others: Sequence[Frame] | None = None,
+    *,
+    cells: int = 2,
+    longest_px: int = 640,
+) -> Tensor:
+    """XFeat features (B, cells² · 64): unit-length descriptors averaged over ``cells`` × ``cells`` parts of images."""
+    features = xfeat.extract_xfeat(network, torch.cat([f.image for f in frames]), scale=1.0, longest_px=longest_px)
+    return torch.stack([torch.nn.functional.adaptive_avg_pool2d(f.D, cells).flatten() for f in features]).float()
 
 
 def load_network_front_ends(
-    dinov2: Callable[..., torch.nn.Module] | None,
+    build: Callable[..., torch.nn.Module] | None,
     *,
     cells: int,
-    xfeat_too: bool,
-    efficientnet_too: bool,
     device: str,
+    xfeat_too: bool = False,
+    efficientnet_too: bool = False,
 ) -> tuple[dict[str, FrontEnd], str | None]:
     """Network front ends by the name of their block, and the origin of DINOv2's weights; None = random weights.
 
     Args:
-        dinov2, cells, device: as :func:`load_visual_front_end` takes them.
+        build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load_dinov2`; None = leave it out.
+        cells, device: of the front ends.
         xfeat_too, efficientnet_too: also load XFeat, EfficientNet-Lite0, with the weights of their packages.
 
     Raises:
         ImportError: a network's package is missing; the message says what to install.
+        FormatError: the weights are not those of one DINOv2 network.
     """
-    network, origin = load_visual_front_end(dinov2, cells=cells, device=device)
-    front_ends: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
+    front_ends: dict[str, FrontEnd] = {}
+    origin, options = None, getattr(build, "keywords", {})
+    if build is not None:
+        network = build().to(device)
+        front_ends["dinov2"] = partial(patch_tokens, network, cells=cells, side=options.get("side", 224))
+        origin = None if options.get("weights") is None else dinov2.describe_weights(network)
     if xfeat_too:
-        front_ends["xfeat"] = DenseFeatures(xfeat.load_xfeat(device).net)
+        front_ends["xfeat"] = partial(dense_features, xfeat.load_xfeat(device).net)
     if efficientnet_too:
-        front_ends["efficientnet"] = efficientnet.MapFeatures(efficientnet.load_efficientnet(device), cells=cells)
+        network = efficientnet.load_efficientnet(device)
+        front_ends["efficientnet"] = partial(efficientnet.map_features, network, cells=cells)
     return front_ends, origin
-
-
-def with_true_depth(frame: Frame, depth: Tensor) -> Frame:
-    """Frame whose sensor is replaced by the true depth (1, H, W) m at every pixel of its image."""
-    return frame.replace(depth=depth, depth_camera=None, conf=None)
-
-
-def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
-    """Depth tokens of a method with the track hint and sparsity of a scene."""
-    return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)
 
 
 def _as_sample(frames: Sequence[Frame]) -> dict[str, Tensor]:
@@ -228,16 +203,10 @@ def _as_sample(frames: Sequence[Frame]) -> dict[str, Tensor]:
         "image": torch.cat([f.image for f in frames]),
         "depth": torch.cat([f.depth for f in frames]),
         "intrinsics": cam.to_matrix(last.camera)[0],
-        "distortion": _distortion(last),
+        "distortion": last.camera.f.new_zeros(5) if last.camera.distortion is None else last.camera.distortion[0],
     }
     if last.depth_camera is not None:
         sample["depth_intrinsics"] = cam.to_matrix(last.depth_camera)[0]
     if all(f.conf is not None for f in frames):
         sample["confidence"] = torch.cat([f.conf for f in frames if f.conf is not None])
     return sample
-
-
-def _distortion(frame: Frame) -> Tensor:
-    """Distortion coefficients of a frame's camera; five zeros without distortion."""
-    coefficients = frame.camera.distortion
-    return frame.camera.f.new_zeros(5) if coefficients is None else coefficients[0]

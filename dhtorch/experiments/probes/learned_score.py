@@ -20,17 +20,25 @@ from torch import Tensor
 from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
-from dhtorch.experiments import protocol
 from dhtorch.experiments.finished_scenes import FinishedScenes
-from dhtorch.experiments.protocol import Batch, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.protocol import (
+    Batch,
+    Method,
+    Outcome,
+    Progress,
+    Protocol,
+    ScenePairs,
+    Settings,
+    Variant,
+    held_back_truth,
+    no_progress,
+    run_protocol,
+)
 from dhtorch.metrics import bootstrap, risk
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pytree import Record, collate, record
 from dhtorch.records import PoseFit, Tracks
 from dhtorch.stages.score import LearnedScore, confidence, confidence_from_error, expected_error_loss, score_features
-
-QUESTION = "Does a score trained on errors rank answers better than the analytic ones, in rooms not trained on?"
-EXPECTATION = "Its AURC is lower than that of the paper's score and of rank_by_error, as a geometric mean over scenes."
 
 #: Hand-designed scores: variant → function.
 _HAND_MADE_SCORES = {"paper": confidence, "by_error": confidence_from_error}
@@ -56,7 +64,7 @@ def run(
     weight_decay: float = 0.01,
     most: int = 1000,
     save: str | None = None,
-    progress: Progress = protocol.no_progress,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Run the experiment: answers of one method with three scores; the learned score is cross-validated over rooms.
 
@@ -82,7 +90,7 @@ def run(
     answers = _AnswerCache()
     all_scenes = replace(settings, finished=FinishedScenes())  # the answers of every scene are needed in memory
     first = Protocol({name: Variant(method)}, {"full": answers.store})
-    protocol.run(scenes, first, pairs, all_scenes, progress=progress)
+    run_protocol(scenes, first, pairs, all_scenes, progress=progress)
     options: dict[str, Any] = {"hidden": hidden, "steps": steps, "learning_rate": learning_rate}
     options |= {"weight_decay": weight_decay, "most": most}
     rooms = {scene.name: _room_name(scene) for scene in scenes_of(scenes)}
@@ -102,14 +110,18 @@ def run(
         score: Variant(method, fit=answers.fit, call_options=make_options, needs=needs.get(score, Variant.needs))
         for score, make_options in options_by_score.items()
     }
-    outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    outcome = run_protocol(scenes, Protocol(variants), pairs, settings, progress=progress)
     ratios = compare_scores(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
     outcome.summary |= {k: v.entry() for k, v in ratios.items()}
     if save is not None and answers.labelled():
         scorer = train_score(list(answers.labelled().values()), **options)
         scorer.provenance = {"method": name, "scenes": [*answers.labelled()], "seed": settings.seed, **options}
         scorer.save(Path(save))
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(ratios))
+    return outcome.decide(
+        "Does a score trained on errors rank answers better than the analytic ones, in rooms not trained on?",
+        "Its AURC is lower than that of the paper's score and of rank_by_error, as a geometric mean over scenes.",
+        *verdict(ratios),
+    )
 
 
 def train_score(
@@ -209,7 +221,7 @@ class _AnswerCache:
 
     def store(self, batch: Batch, trace: Trace) -> Any:
         """Ground truth of the held-out returns of a batch; stores its tracks, pose and labelled answers."""
-        truth = protocol.held_back_truth(batch, trace)
+        truth = held_back_truth(batch, trace)
         self._fits[_batch_key(batch)] = trace["tracks"], trace["fit"]
         if batch.scene.role is None:
             self._answers.setdefault(batch.scene.name, []).append(label_answers(trace, truth.depth, truth.ok))

@@ -19,6 +19,8 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,9 +30,10 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data.scene import Scene
+from dhtorch.experiments.loading import FrameChunk, LoadedChunk, read_chunks
 from dhtorch.experiments.outcome import MainMetric, Row
 from dhtorch.experiments.probes import ridge as probe
-from dhtorch.experiments.protocol import Outcome
+from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.runtime import results as result_files
@@ -158,15 +161,24 @@ class ProbeShards:
         self._files.append((group, file))
         self.n += len(shard.target)
 
-    def missing(self, entries: Sequence[tuple[str, object]]) -> list[bool]:
-        """Whether the shard of each (group, key) would be computed if they were added in this order."""
+    def add_all(
+        self,
+        entries: Sequence[tuple[str, object, Sequence[FrameChunk], Callable[[Iterator[LoadedChunk]], ProbeShard]]],
+        settings: Settings,
+    ) -> None:
+        """Add shards: group, key, chunks of frames, and the function that makes the shard of these.
+
+        The frames of all shards that the folder lacks are read ahead in ``settings.workers`` processes.
+        """
         known: set[Path] = set()
-        result = []
-        for group, key in entries:
+        wanted: list[FrameChunk] = []
+        for group, key, chunks, _ in entries:
             file = self._file(group, key)
-            result.append(file not in known and not file.is_file())
+            wanted += [] if file in known or file.is_file() else chunks
             known.add(file)
-        return result
+        read = read_chunks(wanted, settings.dtype, settings.workers)
+        for group, key, chunks, make in entries:
+            self.add(group, key, partial(make, islice(read, len(chunks))))
 
     def _file(self, group: str, key: object) -> Path:
         text = re.sub(r" at 0x[0-9a-f]+", "", repr((group, key)))
@@ -296,11 +308,14 @@ def evaluate_probes(
     scale = shards.target_spread()
     for fold in probe.make_folds(groups, n_folds, seed=seed):
         fitted = _fit_fold(shards, fold, arms, grid, scale)
-        for arm, (_, _, chosen) in fitted.probes.items():
+        for arm, (_, _, chosen) in fitted.items():
             errors_by_arm.penalties.setdefault(arm, []).append(chosen)
         for shard in shards.read(fold.test):
             g = group_index[shard.group]
-            squares = {arm: fitted.errors(arm, shard)[0] for arm in arms}
+            squares = {}
+            for arm, (index, linear, _) in fitted.items():
+                prediction = probe.predict_targets(linear, shard.features()[:, index])[0]
+                squares[arm] = scaled_squared_error(prediction, shard.target, scale)
             squares |= {
                 arm: scaled_squared_error(shard.blocks[block], shard.target, scale)
                 for arm, block in predictions.items()
@@ -313,62 +328,41 @@ def evaluate_probes(
     return errors_by_arm
 
 
-@dataclass
-class _FittedFold:
-    """Probes fitted in one fold: arm → (feature columns, linear map of the chosen penalty, penalty of each block)."""
-
-    scale: Tensor  # (D,) of the targets
-    probes: dict[str, tuple[Tensor, probe.LinearProbe, list[float]]] = field(default_factory=dict)
-
-    def errors(self, arm: str, shard: ProbeShard) -> Tensor:
-        """Squared errors (P, n) on a shard, mean over the targets; NaN where a sample has a NaN feature or target."""
-        index, linear, _ = self.probes[arm]
-        return scaled_squared_error(probe.predict_targets(linear, shard.features()[:, index]), shard.target, self.scale)
-
-
 def scaled_squared_error(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
     """Squared errors (…, n) of predictions (…, n, D) in units of ``scale`` (D,), mean over the targets."""
     return ((answer.double() - target.double()) / scale).square().mean(-1)
 
 
+#: A fitted probe: feature columns, linear map of the chosen penalty, penalty of each block.
+_Fitted = tuple[Tensor, probe.LinearProbe, list[float]]
+
+
 def _fit_fold(
     shards: ProbeShards, fold: probe.ProbeFold, arms: Mapping[str, Sequence[str]], grid: Tensor, scale: Tensor
-) -> _FittedFold:
+) -> dict[str, _Fitted]:
     """Ridge probes of every arm for one fold, with the penalties that minimise the error on ``fold.choose``."""
     stream = probe.MomentStream(sum(shards.widths.values()), len(scale))
-    fitted = _FittedFold(scale)
     for shard in shards.read(fold.train):
         stream.add(shard.features(), shard.target)
-    context_choice = _choose_penalties(
-        shards, fold, stream.moments, fitted, arm=CONTEXT_BLOCK, blocks=(), penalties=grid[:, None]
-    )
-    context_penalty = context_choice[0] if context_choice else float(grid[0])
+    fit = partial(_choose_penalties, shards, fold, stream.moments, scale)
+    fitted = {CONTEXT_BLOCK: fit((), grid[:, None])}
+    context_penalty = fitted[CONTEXT_BLOCK][2][0]
     for arm, blocks in arms.items():
         if blocks:
             block_penalties = torch.cartesian_prod(*[grid] * len(blocks)).view(-1, len(blocks))
             context = torch.full((len(block_penalties), 1), context_penalty, dtype=grid.dtype)
-            _choose_penalties(
-                shards,
-                fold,
-                stream.moments,
-                fitted,
-                arm=arm,
-                blocks=blocks,
-                penalties=torch.cat((context, block_penalties), 1),
-            )
-    return fitted
+            fitted[arm] = fit(blocks, torch.cat((context, block_penalties), 1))
+    return {arm: fitted[arm if blocks else CONTEXT_BLOCK] for arm, blocks in arms.items()}
 
 
 def _choose_penalties(
     shards: ProbeShards,
     fold: probe.ProbeFold,
     moments: probe.SampleMoments,
-    fitted: _FittedFold,
-    *,
-    arm: str,
+    scale: Tensor,
     blocks: Sequence[str],
     penalties: Tensor,  # (P, 1 + blocks), first column: the context
-) -> list[float]:
+) -> _Fitted:
     """Fit one arm with every row of ``penalties``; keep the one with the smallest error on ``fold.choose``."""
     names = (CONTEXT_BLOCK, *blocks)
     index = shards.columns(names)
@@ -377,11 +371,9 @@ def _choose_penalties(
     total = torch.zeros(len(penalties), dtype=torch.float64)
     for shard in shards.read(fold.choose):
         prediction = probe.predict_targets(linear, shard.features()[:, index])
-        total += scaled_squared_error(prediction, shard.target, fitted.scale).nan_to_num(0.0).sum(-1)
+        total += scaled_squared_error(prediction, shard.target, scale).nan_to_num(0.0).sum(-1)
     best = slice(k := int(total.argmin()), k + 1)
-    chosen: list[float] = penalties[k].tolist()
-    fitted.probes[arm] = (index, linear[best], chosen)
-    return chosen
+    return index, linear[best], penalties[k].tolist()
 
 
 def check_controls(positive: Interval, negative: Interval, depth: Interval | None = None) -> str | None:

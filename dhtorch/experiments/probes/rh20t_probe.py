@@ -24,9 +24,8 @@ Intervals here come from resampling tasks: about 146 units of RH20T, not 799.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,9 +37,8 @@ from dhtorch.data import convert
 from dhtorch.data.readers import rh20t
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2 as visual_branch
-from dhtorch.experiments.outcome import Row
+from dhtorch.experiments.loading import LoadedChunk
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.probes.probing import (
@@ -61,9 +59,6 @@ from dhtorch.experiments.probes.probing import (
     ProbeShards,
 )
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
-
-QUESTION = "Do depth features predict a robot's next motion as well as DINOv2's in a ridge probe?"
-EXPECTATION = "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move."
 
 #: Joint angles in the context; zeros fill up for a robot with fewer joints.
 _N_JOINTS = 7
@@ -140,25 +135,30 @@ def run(
     method = next(iter(methods.values()))
     outcome = Outcome(metrics=PROBE_METRICS)
     with ProbeShards(features, [scene for scene, _ in chosen]) as shards:
-        outcome.rows += [_skip_reason(scene.recording) for scene, samples in chosen if not samples[0]]
+        common = {"pair": None, "method": CONTEXT_BLOCK, "truth": PROBE_TRUTH, "role": None}
+        note = "no sample: poses of the hand do not cover history and horizon"
+        outcome.rows += [{"scene": s.recording.name, **common, "note": note} for s, samples in chosen if not samples[0]]
         chosen = [(scene, samples) for scene, samples in chosen if samples[0]]
         true_depth = all(isinstance(scene.recording, TruthRecording) for scene, _ in chosen)
         sizes: dict[str, Any] = {"cells": depth_cells, "rgb_side": rgb_side, "moving": moving}
-        common = (method, sizes, origin, sorted(networks), settings.seed, str(settings.dtype), true_depth)
-        keys = [(task_name(scene.recording), (scene.name, samples[:2], *common)) for scene, samples in chosen]
-        wanted = [k for k, missing in enumerate(shards.missing(keys)) if missing]
-        reader = _read_samples({k: chosen[k] for k in wanted}, settings, true_depth)
-        for k, ((task, key), (scene, samples)) in enumerate(zip(keys, chosen, strict=True)):
-            read = partial(_read_scene, reader, k, scene.name, progress)
-            shards.add(
-                task, key, partial(_make_shard, scene, samples, read, method, networks, settings=settings, **sizes)
-            )
+        key = (method, sizes, origin, sorted(networks), settings.seed, str(settings.dtype), true_depth)
+        entries = []
+        for scene, samples in chosen:
+            rows = probing.split_into_chunks(list(zip(*samples[:2], strict=True)), settings.batch)
+            make = partial(_make_shard, scene, samples, method, networks, settings=settings, progress=progress, **sizes)
+            chunks = [(scene.recording, part, true_depth) for part in rows]
+            entries.append((task_name(scene.recording), (scene.name, samples[:2], *key), chunks, make))
+        shards.add_all(entries, settings)
         arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
         probe_errors = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n
     probing.record_probes(outcome, probe_errors)
     outcome.summary = probing.summarise_probes(probe_errors)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(probe_errors, origin, margin))
+    return outcome.decide(
+        "Do depth features predict a robot's next motion as well as DINOv2's in a ridge probe?",
+        "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move.",
+        *verdict(probe_errors, origin, margin),
+    )
 
 
 def select_robot_samples(
@@ -191,7 +191,11 @@ def select_robot_samples(
     before = np.abs(times[:, None] - history - times[None]).argmin(1)
     valid = has_now & has_then & has_past & (before < np.arange(len(times)))
     index = np.flatnonzero(valid)[::stride]
-    hand_pose, ahead, behind = (_pose_matrices(x[index], recording.root) for x in (now, then, past))
+    hand_pose, ahead, behind = (
+        # translations (m) and quaternions wxyz
+        convert.to_c2w(x[index][:, [4, 5, 6, 3]], x[index][:, :3], recording.root, "tcp")
+        for x in (now, then, past)
+    )
     base_to_hand = np.linalg.inv(hand_pose)
     target, last = (_motion_vectors(base_to_hand @ pose) for pose in (ahead, behind))
     angles = np.zeros((len(index), _N_JOINTS))
@@ -265,56 +269,25 @@ def task_name(recording: Recording) -> str:
     return match[0] if match else str(recording.name)
 
 
-def _skip_reason(recording: Recording) -> Row:
-    """Row of a scene without samples, with the reason as its note."""
-    note = "no sample: poses of the hand do not cover history and horizon"
-    return {
-        "scene": recording.name,
-        "pair": None,
-        "method": CONTEXT_BLOCK,
-        "truth": PROBE_TRUTH,
-        "role": None,
-        "note": note,
-    }
-
-
-def _read_samples(
-    chosen: Mapping[int, tuple[Scene, tuple[list[int], list[int], Tensor, Tensor]]], settings: Settings, truth: bool
-) -> loading.ChunkReader:
-    """Reader of the frames of the samples of numbered scenes with their second views, ``settings.batch`` at once."""
-    groups = {
-        k: [
-            loading.FrameChunk(scene.recording, rows, truth)
-            for rows in probing.split_into_chunks(list(zip(index, before, strict=True)), settings.batch)
-        ]
-        for k, (scene, (index, before, _, _)) in chosen.items()
-    }
-    return loading.ChunkReader(groups, settings.dtype, settings.workers)
-
-
-def _read_scene(reader: loading.ChunkReader, k: int, name: str, progress: Progress) -> Iterable[loading.LoadedChunk]:
-    """Chunks of scene ``k``."""
-    return progress(reader.read(k), name, reader.length(k))
-
-
 @torch.no_grad()
 def _make_shard(
     scene: Scene,
     samples: tuple[list[int], list[int], Tensor, Tensor],
-    read: Callable[[], Iterable[loading.LoadedChunk]],
     method: Method,
     networks: Mapping[str, front_ends.FrontEnd],
-    settings: Settings,
+    read: Iterator[LoadedChunk],
     *,
+    settings: Settings,
+    progress: Progress,
     cells: int,
     rgb_side: int,
     moving: float,
 ) -> ProbeShard:
     """Shard of one scene's samples (indices, second views, context, target), from its chunks of frames."""
     _, _, context, target = samples
-    recording = scene.recording
-    options: dict[str, Any] = {"cells": cells, "seed": settings.seed}
-    two_view, one_view = (front_ends.depth_tokens_for_scene(method, scene, views=v, **options) for v in (2, 1))
+    options: dict[str, Any] = {"cells": cells, "seed": settings.seed, "hint": scene.hint}
+    options["sparse"] = scene.recording.sparse
+    two_view, one_view = (front_ends.DepthTokens(method, views=v, **options) for v in (2, 1))
     all_front_ends: dict[str, front_ends.FrontEnd] = {
         "rgb": partial(front_ends.resize_to_square, side=rgb_side),
         "depth": two_view,
@@ -322,21 +295,18 @@ def _make_shard(
         **networks,
     }
     parts: dict[str, list[Tensor]] = {name: [] for name in all_front_ends}
-    for rows, truth in read():
+    n_chunks = -(-len(target) // max(1, settings.batch))
+    for rows, truth in progress(read, scene.name, n_chunks):
         frames, seconds = ([frame.to(settings.device) for frame in column] for column in zip(*rows, strict=True))
         for name, front_end in all_front_ends.items():
             parts[name].append(front_end(frames, seconds).cpu())
         if truth:
-            exact = [front_ends.with_true_depth(f, d.to(settings.device)) for f, d in zip(frames, truth, strict=True)]
+            depths = (depth.to(settings.device) for depth in truth)
+            exact = [f.replace(depth=d, depth_camera=None, conf=None) for f, d in zip(frames, depths, strict=True)]
             parts.setdefault(DEPTH_CONTROL, []).append(one_view(exact).cpu())
     blocks = {name: torch.cat(x) for name, x in parts.items()}
     is_moving = target[:, :3].norm(dim=-1) > moving
-    return ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving)
-
-
-def _pose_matrices(tcp: np.ndarray, file: Path) -> np.ndarray:
-    """Poses (n, 4, 4) of (n, 7) translations (m) and quaternions wxyz."""
-    return convert.to_c2w(tcp[:, [4, 5, 6, 3]], tcp[:, :3], file, "tcp")
+    return ProbeShard(task_name(scene.recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving)
 
 
 def _motion_vectors(T: np.ndarray) -> Tensor:

@@ -17,17 +17,16 @@ which say nothing about DINOv2. An undecided ratio comes with the number of room
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
-from dhtorch.experiments import loading
 from dhtorch.experiments.baselines import dinov2 as visual_branch
+from dhtorch.experiments.loading import LoadedChunk
 from dhtorch.experiments.outcome import Row
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
@@ -48,10 +47,6 @@ from dhtorch.experiments.probes.probing import (
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.geometry import se3
 from dhtorch.metrics.bootstrap import Interval
-from dhtorch.records import Frame
-
-QUESTION = "Within one scene, do depth features predict the camera's motion better than DINOv2's in a ridge probe?"
-EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
 
 #: Block of a shard with the method's own relative pose.
 _OWN_POSE_BLOCK = "pose"
@@ -127,9 +122,9 @@ def run(
     )
     left_out = {XFEAT_BLOCK: not xfeat, EFFICIENTNET_BLOCK: not efficientnet, DEPTH_CONTROL: True}
     arm_names = [*(a for a, names in PROBE_ARMS.items() if not any(left_out.get(n) for n in names)), _POSE_ARM]
-    extractor = _PairFeatures(
-        settings, next(iter(methods.values())), networks, cells=depth_cells, rgb_side=rgb_side, origin=origin
-    )
+    method = next(iter(methods.values()))
+    options: dict[str, Any] = {"networks": networks, "cells": depth_cells, "rgb_side": rgb_side, "moving": moving}
+    options |= {"method": method, "settings": settings, "progress": progress}
     outcome = Outcome(metrics=PROBE_METRICS)
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
@@ -137,7 +132,9 @@ def run(
     probed: dict[str, list[tuple[Scene, list[list[tuple[int, int]]]]]] = {}
     for room, members in rooms.items():
         blocks_of = [(s, split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members))))) for s in members]
-        note = _reason_to_leave_out([block for _, scene_blocks in blocks_of for block in scene_blocks], min_pairs)
+        lengths = [len(block) for _, scene_blocks in blocks_of for block in scene_blocks]
+        few = f"fewer than {_MIN_BLOCKS} blocks with pairs" if sum(map(bool, lengths)) < _MIN_BLOCKS else ""
+        note = few if sum(lengths) >= min_pairs else f"{sum(lengths)} pairs with known motion, fewer than {min_pairs}"
         if note:
             outcome.rows += [
                 {"scene": room, "pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None, "note": note}
@@ -154,16 +151,28 @@ def run(
                 for k, block in enumerate(scene_blocks)
                 if block
             ]
-            extractor.add(shards, parts, moving, progress)
+            key = (method, depth_cells, rgb_side, origin, sorted(networks), settings.seed)
+            entries = []
+            for group, scene, block in parts:
+                positions = sorted({k for pair in block for k in pair})
+                rows = probing.split_into_chunks([(i,) for i in positions], settings.batch)
+                make = partial(_make_shard, group, scene, block, **options)
+                chunks = [(scene.recording, part, False) for part in rows]
+                entries.append((group, (scene.name, len(scene.recording), list(block), moving, *key), chunks, make))
+            shards.add_all(entries, settings)
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
-            options: dict[str, Any] = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
-            errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
+            folds: dict[str, Any] = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
+            errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **folds)
             outcome.n_pairs += shards.n
         probing.record_probes(outcome, errors, name)
         if REFERENCE_BLOCK in arms:
             needed[name] = probing.groups_needed(errors, _OURS, REFERENCE_BLOCK, probing.ALL_COHORT, _PUBLISHED_RATIO)
     outcome.summary = probing.summarise_over_scenes(outcome, arm_names)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, origin, needed))
+    return outcome.decide(
+        "Within one scene, do depth features predict the camera's motion better than DINOv2's in a ridge probe?",
+        "Yes: on every scene the error with depth features is smaller than DINOv2's.",
+        *verdict(outcome, origin, needed),
+    )
 
 
 def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
@@ -217,9 +226,10 @@ def _failed_control(outcome: Outcome, scene: str) -> str | None:
 
 def _describe_room(scene: str, ours: Row, theirs: Row, needed: int | None) -> str:
     """Errors, ratio and what is to be said of them."""
-    text = f"{scene} {ours['mse']:.2f} against {theirs['mse']:.2f}{_format_interval(ours)}"
+    text = f"{scene} {ours['mse']:.2f} against {theirs['mse']:.2f}"
     remarks = probing.describe_error(ours["mse"], _interval(ours, "vs_context"))
     low, high = ours.get("vs_dinov2_low"), ours.get("vs_dinov2_high")
+    text += "" if low is None or high is None else f", ratio {ours['vs_dinov2']:.2f} ({low:.2f} to {high:.2f})"
     if needed is not None and low is not None and high is not None and low <= 1 <= high:
         remarks += f"{'; ' * bool(remarks)}the paper's ratio would be seen with about {needed} such groups"
     return f"{text} [{remarks}]" if remarks else text
@@ -229,119 +239,55 @@ def _interval(row: Row, name: str) -> Interval:
     return Interval(row.get(name), row.get(f"{name}_low"), row.get(f"{name}_high"), row.get("n_samples") or 0)
 
 
-def _reason_to_leave_out(blocks: Sequence[Sequence[tuple[int, int]]], min_pairs: int) -> str | None:
-    """Why a room with these blocks of pairs is not probed; None = it is."""
-    if (n := sum(map(len, blocks))) < min_pairs:
-        return f"{n} pairs with known motion, fewer than {min_pairs}"
-    return f"fewer than {_MIN_BLOCKS} blocks with pairs" if sum(map(bool, blocks)) < _MIN_BLOCKS else None
+@torch.no_grad()
+def _make_shard(
+    group: str,
+    scene: Scene,
+    block: Sequence[tuple[int, int]],
+    read: Iterator[LoadedChunk],
+    *,
+    method: Method,
+    networks: Mapping[str, front_ends.FrontEnd],
+    settings: Settings,
+    cells: int,
+    rgb_side: int,
+    moving: float,
+    progress: Progress,
+) -> ProbeShard:
+    """Shard of one block of pairs, ``settings.batch`` at once; those of a single frame are computed once.
 
-
-class _PairFeatures:
-    """Features of pairs, ``settings.batch`` at once; those of a single frame are computed once per block."""
-
-    def __init__(
-        self,
-        settings: Settings,
-        method: Method,
-        networks: Mapping[str, front_ends.FrontEnd],
-        *,
-        cells: int,
-        rgb_side: int,
-        origin: str | None,
-    ) -> None:
-        self.settings, self.method, self.networks = settings, method, networks
-        self.cells, self.rgb_side, self.origin = cells, rgb_side, origin
-
-    def add(
-        self,
-        shards: ProbeShards,
-        parts: Sequence[tuple[str, Scene, Sequence[tuple[int, int]]]],
-        moving: float,
-        progress: Progress,
-    ) -> None:
-        """Add the shards of blocks of pairs (group, scene, block): features, motions, and whether each moves more than
-        ``moving`` m."""
-        common = (self.method, self.cells, self.rgb_side, self.origin, sorted(self.networks), self.settings.seed)
-        keys = [(group, (s.name, len(s.recording), list(block), moving, *common)) for group, s, block in parts]
-        wanted = [k for k, missing in enumerate(shards.missing(keys)) if missing]
-        reader = self._reader({k: parts[k] for k in wanted})
-        for k, ((group, key), (_, scene, block)) in enumerate(zip(keys, parts, strict=True)):
-            make = partial(self._make_shard, group, scene, block, moving, progress, read=partial(reader.read, k))
-            shards.add(group, key, make)
-
-    def _reader(self, parts: Mapping[int, tuple[str, Scene, Sequence[tuple[int, int]]]]) -> loading.ChunkReader:
-        """Reader of the frames of numbered blocks, each frame once, ``settings.batch`` at once."""
-        groups = {
-            k: [
-                loading.FrameChunk(scene.recording, [(i,) for i in positions])
-                for positions in probing.split_into_chunks(_positions(block), self.settings.batch)
-            ]
-            for k, (_, scene, block) in parts.items()
-        }
-        return loading.ChunkReader(groups, self.settings.dtype, self.settings.workers)
-
-    def _make_shard(
-        self,
-        group: str,
-        scene: Scene,
-        block: Sequence[tuple[int, int]],
-        moving: float,
-        progress: Progress,
-        read: Callable[[], Iterable[loading.LoadedChunk]],
-    ) -> ProbeShard:
-        """Shard of one block of pairs."""
-        i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
-        poses = scene.recording.poses
-        assert poses is not None  # scenes without poses have no blocks
-        target = probing.motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
-        in_order = [frame.to(self.settings.device) for rows, _ in read() for (frame,) in rows]
-        frames = dict(zip(_positions(block), in_order, strict=True))
-        features = self._features(scene, block, frames, progress)
-        blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **features}
-        return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)
-
-    @torch.no_grad()
-    def _features(
-        self, scene: Scene, block: Sequence[tuple[int, int]], frames: Mapping[int, Frame], progress: Progress
-    ) -> dict[str, Tensor]:
-        """Features (n, F) of the pairs by block of features: frame ``i``, then ``j`` minus ``i``."""
-        settings = self.settings
-        two_view, one_view = (
-            front_ends.depth_tokens_for_scene(self.method, scene, cells=self.cells, seed=settings.seed, views=v)
-            for v in (2, 1)
-        )
-        single: dict[str, front_ends.FrontEnd] = {
-            "rgb": partial(front_ends.resize_to_square, side=self.rgb_side),
-            "depth_one_view": one_view,
-            **self.networks,
-        }
-        order = {k: n for n, k in enumerate(frames)}
-        a, b = ([order[p[side]] for p in block] for side in (0, 1))
-        features = {}
-        for name, front_end in single.items():
-            parts = [front_end(chunk) for chunk in probing.split_into_chunks(list(frames.values()), settings.batch)]
-            x = torch.cat(parts).cpu()
-            features[name] = torch.cat((x[a], x[b] - x[a]), 1)
-        forth, back, own = [], [], []
-        chunks = probing.split_into_chunks(list(block), settings.batch)
-        for chunk in progress(chunks, scene.name, len(chunks)):
-            first, second = ([frames[p[side]] for p in chunk] for side in (0, 1))
-            x, added = two_view.features_and_keys(first, second)
-            forth.append(x.cpu())
-            back.append(two_view(second, first).cpu())
-            # The transform's pose maps the reference view into the other view: the same way round as the target.
-            motion = probing.motion_vectors(added["T_1_from_0"].double())
-            own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
-        depth = torch.cat(forth)
-        return {**features, "depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
-
-
-def _positions(block: Sequence[tuple[int, int]]) -> list[int]:
-    """Positions of the frames of a block of pairs, each once, in order."""
-    return sorted({k for pair in block for k in pair})
-
-
-def _format_interval(row: Row) -> str:
-    """Text of the ratio to DINOv2's error with its interval; empty without an interval."""
-    low, high = row.get("vs_dinov2_low"), row.get("vs_dinov2_high")
-    return "" if low is None or high is None else f", ratio {row['vs_dinov2']:.2f} ({low:.2f} to {high:.2f})"
+    Features (n, F) by block of features: of frame ``i``, then of ``j`` minus ``i``.
+    """
+    i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
+    poses = scene.recording.poses
+    assert poses is not None  # scenes without poses have no blocks
+    target = probing.motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
+    in_order = [frame.to(settings.device) for rows, _ in read for (frame,) in rows]
+    frames = dict(zip(sorted({k for pair in block for k in pair}), in_order, strict=True))
+    tokens: dict[str, Any] = {"cells": cells, "seed": settings.seed, "hint": scene.hint}
+    tokens["sparse"] = scene.recording.sparse
+    two_view, one_view = (front_ends.DepthTokens(method, views=v, **tokens) for v in (2, 1))
+    single: dict[str, front_ends.FrontEnd] = {
+        "rgb": partial(front_ends.resize_to_square, side=rgb_side),
+        "depth_one_view": one_view,
+        **networks,
+    }
+    order = {k: n for n, k in enumerate(frames)}
+    a, b = ([order[p[side]] for p in block] for side in (0, 1))
+    blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0)}
+    for name, front_end in single.items():
+        x = torch.cat([front_end(chunk) for chunk in probing.split_into_chunks(in_order, settings.batch)]).cpu()
+        blocks[name] = torch.cat((x[a], x[b] - x[a]), 1)
+    forth, back, own = [], [], []
+    chunks = probing.split_into_chunks(list(block), settings.batch)
+    for chunk in progress(chunks, scene.name, len(chunks)):
+        first, second = ([frames[p[side]] for p in chunk] for side in (0, 1))
+        x, added = two_view.features_and_keys(first, second)
+        forth.append(x.cpu())
+        back.append(two_view(second, first).cpu())
+        # The transform's pose maps the reference view into the other view: the same way round as the target.
+        motion = probing.motion_vectors(added["T_1_from_0"].double())
+        own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
+    depth = torch.cat(forth)
+    blocks |= {"depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
+    return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)

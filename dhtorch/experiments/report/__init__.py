@@ -16,8 +16,8 @@ from typing import Any
 
 from dhtorch.codes import Gate, describe, words
 from dhtorch.experiments.report import jobs, page, text
+from dhtorch.experiments.report.cells import Result, describe_result, metric_value, scene_rows
 from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
-from dhtorch.experiments.report.reading import Result, describe_result, metric_value, scene_rows
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, generic_tables
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import Progress, format_count, get_verbosity

@@ -11,16 +11,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Hole, Source, names, words
-from dhtorch.experiments.report.layouts import (
-    KNEE_DEFINITION,
-    branch_name,
-    is_whole_branch,
-    published_counterparts,
-    threshold_knee,
-    threshold_points,
-)
-from dhtorch.experiments.report.published import PAPER, parse_printed
-from dhtorch.experiments.report.reading import (
+from dhtorch.experiments.report.cells import (
     Result,
     Row,
     deciding_rows,
@@ -30,6 +21,15 @@ from dhtorch.experiments.report.reading import (
     summary_entry,
     variant_names,
 )
+from dhtorch.experiments.report.layouts import (
+    KNEE_DEFINITION,
+    branch_name,
+    is_whole_branch,
+    published_counterparts,
+    threshold_knee,
+    threshold_points,
+)
+from dhtorch.experiments.report.published import PAPER, parse_printed
 from dhtorch.metrics.risk import find_knee
 from dhtorch.viz.plots import add_legend, assign_strokes, draw_line, make_figure, mark_options, set_axis, set_title
 from dhtorch.viz.plots.colours import (
@@ -73,11 +73,14 @@ def result_figures(result: Result) -> list[Figure]:
     """All figures for which a result has the numbers."""
     errors = "Median relative error of the answers in tenths of the candidates by true depth; logarithmic."
     coverage = "Answered fraction in tenths of the candidates by true depth."
+    motion = "Every dot is one gap between the two views, drawn at the median baseline of that gap."
     figures = (
         _latency(result),
         _side_by_side(result),
         _cutoffs(result),
-        _motion(result),
+        _along(result, "Motion dependence", motion, lambda row: row.get("baseline_m"), "baseline, m", {})
+        if result["experiment"] == "motion"
+        else None,
         _thresholds(result),
         _holes(result),
         _risk(result),
@@ -182,14 +185,6 @@ def _cutoffs(result: Result) -> Figure | None:
     caption = "The default cutoff is 2 m in the paper; here it is each scene's own near limit or the job's cutoff."
     label = "cutoff, ratio to the default"
     return _along(result, "Cutoff sweep", caption, lambda row: ratios.get(row["method"]), label, cited)
-
-
-def _motion(result: Result) -> Figure | None:
-    """Coverage and error against the baseline."""
-    caption = "Every dot is one gap between the two views, drawn at the median baseline of that gap."
-    if result["experiment"] != "motion":
-        return None
-    return _along(result, "Motion dependence", caption, lambda row: row.get("baseline_m"), "baseline, m", {})
 
 
 def _along(

@@ -18,13 +18,15 @@ import numpy as np
 from dhtorch.experiments.outcome import DEPTH_METRICS, MainMetric
 from dhtorch.experiments.report.cells import (
     EMPTY_CELL,
+    Result,
     format_metric_interval,
     format_value,
     metric_heading,
     metric_style,
+    summary_entry,
+    variant_names,
 )
 from dhtorch.experiments.report.figures import Figure, metric_axis
-from dhtorch.experiments.report.reading import Result, summary_entry, variant_names
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count

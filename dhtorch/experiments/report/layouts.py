@@ -10,17 +10,20 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from dhtorch.experiments.report.cells import EMPTY_CELL, format_metric_interval, format_value, metric_heading
-from dhtorch.experiments.report.published import PAPER, parse_printed
-from dhtorch.experiments.report.reading import (
+from dhtorch.experiments.report.cells import (
+    EMPTY_CELL,
     Result,
     Row,
     cohort_names,
+    format_metric_interval,
+    format_value,
     last_cohort,
+    metric_heading,
     scene_rows,
     summary_entry,
     variant_names,
 )
+from dhtorch.experiments.report.published import PAPER, parse_printed
 from dhtorch.experiments.report.tables import (
     DERIVED_NUMBERS,
     INTERVAL_LABEL,

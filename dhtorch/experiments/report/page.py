@@ -7,10 +7,10 @@ from itertools import groupby
 from pathlib import Path
 
 from dhtorch.experiments.report import jobs
+from dhtorch.experiments.report.cells import Result
 from dhtorch.experiments.report.figures import Figure, result_figures
 from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
 from dhtorch.experiments.report.published import PAPER_CITATION
-from dhtorch.experiments.report.reading import Result
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, PUBLISHED_LABEL, ReportTable, full_tables, generic_tables
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
@@ -36,7 +36,34 @@ def render_report(results: Sequence[Result]) -> str:
     sweep = join_markup([table_markup(swept) if swept and is_sweep else "", figures_markup([figure] if figure else [])])
     overview, main = _overview(results), make_tag("main", *sections)
     if any(layout_tables(result) for result in results):
-        body = [make_tag("header", title, make_tag("p", _about(results), class_="lead"), sweep, overview), main]
+        # Introduction: number of results, source of the quoted figures, and data of the results
+        names = dict.fromkeys(result["data"]["name"] for result in results)
+        of_paper = ("tum11", "arkit5")  # sequences of benchmarks that the paper uses
+        benchmark, other = ([n for n in names if (n in of_paper) == is_in] for is_in in (True, False))
+        sentences = [f" marks figures quoted from “{PAPER_CITATION}”, measured on the paper’s own data."]
+        if other:
+            sentences.append("That data could not be downloaded for these results: ours are from other scenes")
+            sentences[-1] += f" ({', '.join(other)})."
+        if benchmark:
+            sentences.append(
+                f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(benchmark)}."
+            )
+        sentences.append("The two are shown side by side for orientation: no line reproduces a line of the paper.")
+        count = f"Everything on this page comes from {format_count(len(results), 'archived result file')}. "
+        body = [
+            make_tag(
+                "header",
+                title,
+                make_tag(
+                    "p",
+                    join_markup((count, make_tag("span", PUBLISHED_LABEL, class_="theirs-word"), " ".join(sentences))),
+                    class_="lead",
+                ),
+                sweep,
+                overview,
+            ),
+            main,
+        ]
     else:  # without lines of the paper the numbers come first
         body = [make_tag("header", title, sweep), main, make_tag("footer", overview)]
     return build_document("dhtorch: results", skip, *body, own=PAGE_CSS)
@@ -57,22 +84,6 @@ def write_report(path: Path, results: Sequence[Result]) -> Path:
         raise FileNotFoundError(f"{path}: folder {path.parent} does not exist")
     with open_output_file(path, "--html"):
         return storage.replace_file(path, render_report(results).encode("utf-8"))
-
-
-def _about(results: Sequence[Result]) -> Markup:
-    """Introduction: number of results, source of the quoted figures, and data of the results."""
-    names = dict.fromkeys(result["data"]["name"] for result in results)
-    of_paper = ("tum11", "arkit5")  # sequences of benchmarks that the paper uses
-    benchmark, other = ([n for n in names if (n in of_paper) == is_in] for is_in in (True, False))
-    sentences = [f" marks figures quoted from “{PAPER_CITATION}”, measured on the paper’s own data."]
-    if other:
-        sentences.append("That data could not be downloaded for these results: ours are from other scenes")
-        sentences[-1] += f" ({', '.join(other)})."
-    if benchmark:
-        sentences.append(f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(benchmark)}.")
-    sentences.append("The two are shown side by side for orientation: no line reproduces a line of the paper.")
-    count = f"Everything on this page comes from {format_count(len(results), 'archived result file')}. "
-    return join_markup((count, make_tag("span", PUBLISHED_LABEL, class_="theirs-word"), " ".join(sentences)))
 
 
 def _overview(results: Sequence[Result]) -> Markup:

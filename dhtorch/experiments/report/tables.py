@@ -9,26 +9,24 @@ from dataclasses import dataclass
 from dhtorch.codes import words
 from dhtorch.experiments.report.cells import (
     EMPTY_CELL,
-    format_exact,
-    format_metric_interval,
-    format_value,
-    metric_heading,
-)
-from dhtorch.experiments.report.published import PublishedTable
-from dhtorch.experiments.report.reading import (
     NON_METRIC_FIELDS,
     Result,
     Row,
     cohort_names,
     describe_result,
     flatten_row,
+    format_exact,
+    format_metric_interval,
+    format_value,
     last_cohort,
+    metric_heading,
     metric_value,
     scene_label,
     scene_rows,
     summary_entry,
     variant_names,
 )
+from dhtorch.experiments.report.published import PublishedTable
 from dhtorch.runtime.console import format_count
 
 #: Lines of a table: (pattern of our variant, its label or None = its own name, the paper's line or None).
