@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
+from dhtorch.data.codecs.parquet import read_columns, read_row
 from dhtorch.data.io.decode import FormatError
 from dhtorch.extract.columns import KEY_COLUMNS
 from dhtorch.extract.shards import read_shard_metadata, shard_files
-from dhtorch.runtime.safe_open import read_version
 from dhtorch.transforms.sample_access import get_value
 
 
@@ -68,13 +66,8 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
     def __getitem__(self, index: int) -> dict[str, Tensor]:  # type: ignore[override]  # one row at a time
         i = range(len(self))[index]
         k = int(np.searchsorted(self._starts, i, "right")) - 1
-        file = self.files[k]
-        row = i - int(self._starts[k])
-        version = read_version(file)
-        starts = _starts(file, version)
-        group = int(np.searchsorted(starts, row, "right")) - 1
-        at, values = row - starts[group], _group(file, version, (starts[group], starts[group + 1]), self.columns)
-        row_values = {name: torch.from_numpy(np.array(values[name][at])) for name in self.columns}
+        values = read_row(self.files[k], self.columns, i - int(self._starts[k]))
+        row_values = {name: torch.from_numpy(np.array(values[name])) for name in self.columns}
         # In the dtypes of the transform: bool, float32 or int32.
         return {
             self.prefix + name: x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.int()
@@ -118,13 +111,3 @@ class JoinedDataset(Dataset[Any]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         sample = self.dataset[index]
         return {**sample, **self.features.at(*(int(get_value(sample, key)) for key in self.keys))}
-
-
-@lru_cache(maxsize=1024)
-def _starts(file: Path, _version: tuple[int, ...]) -> tuple[int, ...]:
-    return read_parquet_header(file).groups
-
-
-@lru_cache(maxsize=4)
-def _group(file: Path, _version: tuple[int, ...], rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
-    return read_columns(file, columns, rows)

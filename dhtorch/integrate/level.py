@@ -109,7 +109,11 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     subset = torch.nn.functional.normalize(
         normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)]
     )
-    axes = _spiral_directions(12000)  # about 2° apart
+    # Unit vectors (n, 3) spread evenly over the sphere, along a spiral
+    k = torch.arange(12000, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * k / 12000, k * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    axes = torch.stack((r * turn.cos(), r * turn.sin(), z), -1)  # about 2° apart
     axes = axes[axes @ guess > _MIN_GUESS_COSINE]
     upright = torch.asin((subset @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
@@ -117,11 +121,3 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     score = (torch.exp(-0.5 * (upright / 0.087) ** 2) + torch.exp(-0.5 * (level / 0.087) ** 2)).mean(0)
     best = int(score.argmax())
     return axes[best] if float(score[best]) >= 0.25 else None
-
-
-def _spiral_directions(n: int) -> Tensor:
-    """Unit vectors (n, 3) spread evenly over the sphere, along a spiral."""
-    k = torch.arange(n, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * k / n, k * math.pi * (3 - math.sqrt(5))
-    r = (1 - z * z).sqrt()
-    return torch.stack((r * turn.cos(), r * turn.sin(), z), -1)

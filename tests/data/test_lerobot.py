@@ -448,9 +448,9 @@ def test_columns_that_cannot_be_arrays(tmp_path: Path) -> None:
             codec_parquet.read_columns(file, [name])
     read = codec_parquet.read_columns(file, ["text", "deep"], (1, 2))
     assert read["text"] == ["b"] and read["deep"].tolist() == [[[3, 4]]]
-    assert codec_parquet.read_cell(file, "deep", 1).tolist() == [[3, 4]]
+    assert codec_parquet.read_row(file, ("deep",), 1)["deep"].tolist() == [[3, 4]]
     with pytest.raises(FormatError, match=r"rows: found 2, expected row 2"):
-        codec_parquet.read_cell(file, "deep", 2)
+        codec_parquet.read_row(file, ("deep",), 2)
 
 
 def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -254,10 +254,13 @@ def test_a_point_is_seen_where_none_is_nearer_in_its_cell(hw):
     z = torch.from_numpy(np.where(draw.random(3000) < 0.1, -1.0, draw.uniform(1, 1.3, 3000)))
     uv[:4] = torch.tensor([[0.0, 0.0], [hw[1] - 1, hw[0] - 1], [hw[1] - 0.9, 3], [3, hw[0] - 0.9]])
     z[:4] = 0.5
-    seen = scene_model._unoccluded(uv, z, hw)
-    assert seen.tolist() == hidden_by_loops(uv, z, hw) and 20 < int(seen.sum()) < 1500
-    assert seen[:4].tolist() == [True, True, False, False], "pixels of the picture, and beyond"
-    assert scene_model._unoccluded(uv[:0], z[:0], hw).tolist() == []
+    view, want = scene_model.ModelView("a", np.eye(3), hw, np.eye(4)), hidden_by_loops(uv, z, hw)
+    xyz = np.column_stack([uv * z[:, None], z])
+    found, depth = scene_model.SceneModel([view], xyz).seen_points(view)
+    np.testing.assert_allclose(found, uv[want], atol=1e-9)
+    np.testing.assert_array_equal(depth, z[want])
+    assert want[:4] == [True, True, False, False] and 20 < sum(want) < 1500, "pixels of the picture, and beyond"
+    assert not len(scene_model.SceneModel([view]).seen_points(view)[0])
 
 
 def test_points_of_a_view_without_observations_are_projected_through_its_lens():

@@ -49,14 +49,20 @@ def test_a_file_that_changed_is_read_again(tmp_path):
 def test_cells_and_columns_that_are_not_there(tmp_path):
     file = tmp_path / "x.parquet"
     arrow.write_table(table(), file, row_group_size=50)
-    assert [parquet.read_cell(file, "number", row) for row in (60, 61, 99, 100, 199)] == [60, 61, 99, 100, 199]
+    assert [parquet.read_row(file, ("number",), row)["number"] for row in (60, 61, 99, 100, 199)] == [
+        60,
+        61,
+        99,
+        100,
+        199,
+    ]
     read = parquet.read_columns(file, ["number"], (0, 2), optional=["text", "gone"])
     assert list(read) == ["number", "text"] and read["text"] == ["a" * 50, "b"]
     for call, named in (
         (lambda: parquet.read_columns(file, ["gone"]), "columns: found .*, expected gone"),
         (lambda: parquet.read_columns(file, ["number"], (0, 201)), "rows: found 200, expected rows 0 to 200"),
-        (lambda: parquet.read_cell(file, "number", 200), "rows: found 200, expected row 200"),
-        (lambda: parquet.read_cell(file, "number", -1), "rows: found 200, expected row -1"),
+        (lambda: parquet.read_row(file, ("number",), 200), "rows: found 200, expected row 200"),
+        (lambda: parquet.read_row(file, ("number",), -1), "rows: found 200, expected row -1"),
     ):
         with pytest.raises(FormatError, match=named):
             call()

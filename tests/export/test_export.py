@@ -1,19 +1,23 @@
-"""Files for other programs, read back by other programs: plyfile, trimesh, Open3D, COLMAP."""
+"""Files for other programs, read back by other programs (plyfile, trimesh) and by plain parsers: every number, in its place."""
 
-import json
+from __future__ import annotations
+
 import math
-import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from support import known_episodes as known
+from support.known_episodes import HW, LENS
+from support.read_back import Array, linear, read_glb, same
 
 from dhtorch.codes import Hole, Source
 from dhtorch.export import ColmapImage, Shape, nerfstudio, write_colmap, write_glb, write_ply
-from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera
-from dhtorch.viz.plots import colours as palette
 
 XYZ = torch.tensor([[0.5, -1.0, 2.0], [math.nan, 0.0, 1.0], [3.0, 4.0, 5.0], [0.25, 0.5, 1.0]])
 RGB = torch.tensor([[0.0, 0.5, 1.0], [1.0, 1.0, 1.0], [2.0, 0.2, -1.0], [0.1, math.nan, 0.3]])
@@ -27,52 +31,34 @@ FACE = torch.tensor([[0, 2, 3], [0, 1, 3]])
 KEPT = [0, 2, 3]
 
 
-@pytest.fixture
-def ply(tmp_path):
-    path = tmp_path / "points.ply"
-    assert write_ply(path, XYZ, RGB, normal=torch.nn.functional.normalize(XYZ, dim=-1), face=FACE, **ABOUT) == 3
-    return path
+# ---------------------------------------------------------------------------------------------------------------- PLY
 
 
-def test_plyfile_reads_every_property(ply):
-    plyfile = pytest.importorskip("plyfile")
-    data = plyfile.PlyData.read(ply)
+def test_plyfile_and_trimesh_read_every_property(tmp_path: Path) -> None:
+    plyfile, trimesh = pytest.importorskip("plyfile"), pytest.importorskip("trimesh")
+    path, normal = tmp_path / "points.ply", torch.nn.functional.normalize(XYZ, dim=-1)
+    assert write_ply(path, XYZ, RGB, normal=normal, face=FACE, **ABOUT) == 3
+    data = plyfile.PlyData.read(path)
     assert data.byte_order == "<" and not data.text and data.comments == ["metres; x right, y down, z forward"]
-    vertex = data["vertex"]
-    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "sigma", "score", "class", "source"]
-    names.append("quality")
-    assert [p.name for p in vertex.properties] == names
-    assert [p.val_dtype for p in vertex.properties] == ["f4"] * 6 + ["u1"] * 3 + ["f4"] * 2 + ["u1"] * 2 + ["f4"]
-    np.testing.assert_array_equal(vertex["quality"], vertex["sigma"])
-    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), XYZ[KEPT])
-    assert vertex["red"].tolist() == [0, 255, 26] and vertex["green"].tolist() == [128, 51, 0]
-    for name in ("sigma", "score", "source"):
-        np.testing.assert_array_equal(vertex[name], ABOUT[name][KEPT])
-    assert vertex["class"].tolist() == [0, 1, 5]
+    colours = {"red": [0, 255, 26], "green": [128, 51, 0], "blue": [255, 0, 77]}
+    want = {name: (column, "f4") for name, column in zip("xyz", XYZ[KEPT].T, strict=True)}
+    want |= {f"n{name}": (column, "f4") for name, column in zip("xyz", normal[KEPT].T, strict=True)}
+    want |= {name: (column, "u1") for name, column in colours.items()}
+    want |= {name: (ABOUT[name][KEPT], "f4") for name in ("sigma", "score")}
+    want |= {
+        "class": ([0, 1, 5], "u1"),
+        "source": (ABOUT["source"][KEPT], "u1"),
+        "quality": (ABOUT["sigma"][KEPT], "f4"),
+    }
+    assert [(p.name, p.val_dtype) for p in data["vertex"].properties] == [(k, kind) for k, (_, kind) in want.items()]
+    for name, (column, _) in want.items():
+        np.testing.assert_array_equal(data["vertex"][name], column)
     assert [f.tolist() for f in data["face"]["vertex_indices"]] == [[0, 1, 2]], "the triangle of a lost point goes too"
-
-
-def test_trimesh_reads_points_and_mesh(ply, tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.load(ply, process=False)
-    np.testing.assert_array_equal(mesh.vertices, XYZ[KEPT])
+    mesh = trimesh.load(path, process=False)
     assert mesh.faces.tolist() == [[0, 1, 2]] and mesh.visual.vertex_colors[0].tolist() == [0, 128, 255, 255]
-    write_ply(tmp_path / "cloud.ply", XYZ, RGB)
-    cloud = trimesh.load(tmp_path / "cloud.ply")
-    assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == 3
 
 
-def test_open3d_reads_it(ply):
-    o3d = pytest.importorskip("open3d")
-    mesh = o3d.io.read_triangle_mesh(str(ply))
-    np.testing.assert_array_equal(np.asarray(mesh.vertices), XYZ[KEPT])
-    assert len(mesh.triangles) == 1 and mesh.has_vertex_normals() and mesh.has_vertex_colors()
-    cloud = o3d.t.io.read_point_cloud(str(ply))
-    np.testing.assert_allclose(cloud.point["sigma"].numpy().ravel(), ABOUT["sigma"][KEPT])
-    assert cloud.point["source"].numpy().ravel().tolist() == [1, 2, 2]
-
-
-def test_an_empty_ply_and_one_of_arrays(tmp_path):
+def test_an_empty_ply_and_one_of_arrays(tmp_path: Path) -> None:
     path = tmp_path / "empty.ply"
     assert write_ply(path, np.zeros((0, 3)), np.zeros((0, 3)), face=np.zeros((0, 3), int), sigma=np.zeros(0)) == 0
     assert b"element vertex 0\n" in path.read_bytes() and path.read_bytes().endswith(b"end_header\n")
@@ -80,129 +66,98 @@ def test_an_empty_ply_and_one_of_arrays(tmp_path):
     assert b"sigma" not in path.read_bytes()
 
 
+def colmap_points(n: int = 20) -> tuple[dict[str, Any], Array]:
+    """Points of a COLMAP model by argument, with distinct numbers, one without a place and one observation without."""
+    draw = np.random.default_rng(1)
+    xyz = draw.uniform(-2, 2, (n, 3)) + np.array([0, 0, 4])
+    xyz[1, 2] = np.nan
+    seen = draw.permuted(np.tile(np.arange(4), (n, 1)), axis=1)
+    seen[draw.random((n, 4)) < 0.4] = -1
+    uv = draw.uniform(0, 40, (n, 4, 2))
+    uv[3, 2] = np.nan
+    rgb = draw.integers(0, 256, (n, 3)).astype(np.uint8)
+    return {"xyz": xyz, "rgb": rgb, "error": draw.random(n), "seen_by": seen, "uv": torch.from_numpy(uv)}, uv
+
+
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("write", "words"),
     [
-        ({"rgb": RGB[:2]}, r"write_ply: rgb has shape \(2, 3\), expected \(4, 3\)"),
-        ({"sigma": torch.zeros(3)}, r"write_ply: sigma has shape \(3,\), expected \(4\)"),
-        ({"face": FACE[:, :2]}, r"face has shape \(2, 2\), expected \(P, 3\)"),
-        ({"face": FACE + 2}, "face names points 2 to 5, expected 0 to 3"),
-        ({"face": FACE - 1}, "face names points -1 to 2, expected 0 to 3"),
+        *(
+            (lambda path, wrong=wrong: write_ply(path / "a.ply", XYZ, **wrong), words)
+            for wrong, words in [
+                ({"rgb": RGB[:2]}, r"write_ply: rgb has shape \(2, 3\), expected \(4, 3\)"),
+                ({"sigma": torch.zeros(3)}, r"write_ply: sigma has shape \(3,\), expected \(4\)"),
+                ({"face": FACE[:, :2]}, r"face has shape \(2, 2\), expected \(P, 3\)"),
+                ({"face": FACE + 2}, "face names points 2 to 5, expected 0 to 3"),
+                ({"face": FACE - 1}, "face names points -1 to 2, expected 0 to 3"),
+            ]
+        ),
+        (lambda path: write_glb(path / "a.glb", [], up=(0, 0, 0)), "expected a direction"),
+        (lambda path: write_colmap(path, [], **colmap_points()[0]), "seen_by names shot 3, expected at most -1"),
+        (
+            lambda path: write_colmap(path, [], **colmap_points()[0] | {"uv": torch.zeros(20, 4, 1)}),
+            r"uv has shape \(20, 4, 1\), expected \(20, 4, 2\)",
+        ),
+        (
+            lambda _: nerfstudio.make_nerfstudio_frame("a", (30, 40), np.eye(3), np.eye(4), (0, 0, 0, 0, 0, 0.1)),
+            "found 6 distortion coefficients",
+        ),
     ],
-)
-def test_wrong_arrays_raise_and_write_nothing(tmp_path, wrong, words):
+)  # fmt: skip
+def test_wrong_arrays_raise_and_write_nothing(tmp_path: Path, write: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        write_ply(tmp_path / "a.ply", XYZ, **wrong)
+        write(tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_points_of_a_pair_are_coloured_by_their_source():
-    colours = palette.colour_by_source(ABOUT["source"])
-    assert (
-        colours.dtype == np.uint8 and len({tuple(c) for c in colours[:2]}) == len({tuple(c) for c in colours[2:]}) == 1
-    )
-    assert tuple(colours[0]) != tuple(colours[2])
-
-
-def test_an_interrupted_write_leaves_the_old_file(ply, monkeypatch):
-    before = ply.read_bytes()
-    monkeypatch.setattr("dhtorch.runtime.storage.os.fsync", lambda _handle: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        write_ply(ply, XYZ)
-    assert ply.read_bytes() == before and [p.name for p in ply.parent.iterdir()] == ["points.ply"]
 
 
 # ---------------------------------------------------------------------------------------------------------------- GLB
 
 
-def shapes():
+def shapes() -> list[Shape]:
     mesh = Shape("mesh", XYZ, RGB, normal=XYZ, face=FACE)
     return [mesh, Shape("cloud", XYZ[2:] * 2, RGB[2:], values={"sigma": ABOUT["sigma"][2:]})]
 
 
-def test_trimesh_reads_glb_upright_and_in_its_colours(tmp_path):
+def test_a_glb_holds_every_column_and_trimesh_reads_it_upright(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     write_glb(tmp_path / "map.glb", shapes())
+    nodes, (mesh, cloud) = read_glb(tmp_path / "map.glb")
+    assert [node["name"] for node in nodes] == ["mesh", "cloud"] and mesh.keys() ^ cloud.keys() == {
+        "NORMAL",
+        "indices",
+        "_SIGMA",
+    }
+    same(mesh["POSITION"], XYZ[KEPT])
+    same(mesh["NORMAL"], torch.nn.functional.normalize(XYZ[KEPT], dim=-1), 1e-6)
+    same(mesh["COLOR_0"], linear(np.array([[0, 128, 255], [255, 51, 0], [26, 0, 77]])), 1e-6)
+    assert mesh["indices"].tolist() == [0, 1, 2]
+    same(cloud["POSITION"], 2 * XYZ[2:])
+    same(cloud["_SIGMA"], ABOUT["sigma"][2:])
     scene = trimesh.load(tmp_path / "map.glb")
-    assert sorted(scene.geometry) == ["cloud", "mesh"]
-    mesh, cloud = scene.geometry["mesh"], scene.geometry["cloud"]
-    assert isinstance(mesh, trimesh.Trimesh) and isinstance(cloud, trimesh.PointCloud)
-    np.testing.assert_array_equal(mesh.vertices, XYZ[KEPT])
-    assert mesh.faces.tolist() == [[0, 1, 2]]
+    assert isinstance(scene.geometry["mesh"], trimesh.Trimesh) and isinstance(
+        scene.geometry["cloud"], trimesh.PointCloud
+    )
     for name, points in (("mesh", XYZ[KEPT]), ("cloud", 2 * XYZ[2:])):
         T, _ = scene.graph[next(n for n in scene.graph.nodes_geometry if scene.graph[n][1] == name)]
         placed = points.numpy() @ T[:3, :3].T
         np.testing.assert_allclose(placed, points.numpy() * [1, -1, -1], atol=1e-6, err_msg="y up, right-handed")
-    for linear in (mesh.visual.vertex_attributes["color"][1:], cloud.colors / 255.0):
-        display = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        np.testing.assert_allclose(display[:, :3], [[1, 0.2, 0], [0.1, 0, 0.3]], atol=0.02)
-
-
-def glb_parts(path):
-    data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON" and size % 4 == 0
-    body = data[20 + size :]
-    if body:
-        n, kind = struct.unpack_from("<I4s", body)
-        assert kind == b"BIN\0" and n == len(body) - 8 and n % 4 == 0
-    return json.loads(data[20 : 20 + size]), body[8:]
-
-
-def test_glb_keeps_the_rules_of_gltf(tmp_path):
-    """Rules that loaders rely on: aligned views inside the buffer, counts that fit, bounds of positions, unit normals."""
-    write_glb(tmp_path / "map.glb", shapes())
-    document, body = glb_parts(tmp_path / "map.glb")
-    assert document["asset"]["version"] == "2.0" and document["buffers"] == [{"byteLength": len(body)}]
-    sizes = {5126: 4, 5123: 2, 5125: 4}
-    widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-    for accessor in document["accessors"]:
-        view = document["bufferViews"][accessor["bufferView"]]
-        size = sizes[accessor["componentType"]] * widths[accessor["type"]]
-        assert view["byteOffset"] % 4 == 0 and size % 4 == 0 and view["byteLength"] == size * accessor["count"] > 0
-        assert view["byteOffset"] + view["byteLength"] <= len(body)
-    for mesh in document["meshes"]:
-        (primitive,) = mesh["primitives"]
-        names = primitive["attributes"]
-        counts = {document["accessors"][k]["count"] for k in names.values()}
-        assert len(counts) == 1, "every attribute has as many entries"
-        position = document["accessors"][names["POSITION"]]
-        at = document["bufferViews"][position["bufferView"]]["byteOffset"]
-        xyz = np.frombuffer(body, "<f4", 3 * position["count"], at).reshape(-1, 3)
-        assert position["min"] == xyz.min(0).tolist() and position["max"] == xyz.max(0).tolist()
-        if "indices" in primitive:
-            index = document["accessors"][primitive["indices"]]
-            offset = document["bufferViews"][index["bufferView"]]["byteOffset"]
-            assert np.frombuffer(body, "<u4", index["count"], offset).max() < position["count"]
-    cloud = document["meshes"][1]["primitives"][0]
-    assert cloud["mode"] == 0 and {"_SIGMA", "COLOR_0", "POSITION"} == set(cloud["attributes"])
-    normal = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]]
-    at = document["bufferViews"][normal["bufferView"]]["byteOffset"]
-    lengths = np.linalg.norm(np.frombuffer(body, "<f4", 3 * normal["count"], at).reshape(-1, 3), axis=1)
-    np.testing.assert_allclose(lengths, 1, atol=1e-6)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, -1, 0), (0.3, -0.8, 0.2), (1, 0, 0), (1e-9, -1, 0)])
-def test_any_direction_can_point_upwards(tmp_path, up):
+def test_any_direction_can_point_upwards(tmp_path: Path, up: tuple[float, float, float]) -> None:
     write_glb(tmp_path / "map.glb", shapes(), up=up)
-    x, y, z, w = glb_parts(tmp_path / "map.glb")[0]["nodes"][0]["rotation"]
-    v, q = np.array(up) / np.linalg.norm(up), np.array([x, y, z])
-    turned = v + 2 * np.cross(q, np.cross(q, v) + w * v)
-    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-6)
+    x, y, z, w = read_glb(tmp_path / "map.glb")[0][0]["rotation"]
+    np.testing.assert_allclose(rotation((w, x, y, z)) @ up / np.linalg.norm(up), [0, 1, 0], atol=1e-6)
     assert abs(x * x + y * y + z * z + w * w - 1) < 1e-9
 
 
-def test_a_glb_without_anything_is_a_valid_one(tmp_path):
+def test_a_glb_without_anything_is_a_valid_one(tmp_path: Path) -> None:
     write_glb(tmp_path / "map.glb", [Shape("none", torch.full((2, 3), math.nan))])
-    document, body = glb_parts(tmp_path / "map.glb")
-    assert document == {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0, "scenes": [{}]} and not body
-    with pytest.raises(ValueError, match="expected a direction"):
-        write_glb(tmp_path / "map.glb", [], up=(0, 0, 0))
+    assert read_glb(tmp_path / "map.glb") == ([], [])
+    assert (tmp_path / "map.glb").read_bytes()[20:].strip().endswith(b'"scene":0,"scenes":[{}]}')
 
 
-def test_points_become_squares_that_every_mesh_reader_keeps(tmp_path):
+def test_points_become_squares_that_every_mesh_reader_keeps(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     normal = torch.tensor([[0.0, 0, 1], [1, 0, 0], [math.nan, 0, 0], [0, 3, 4]])
     cloud = Shape("cloud", XYZ, RGB, normal=normal, values={"sigma": ABOUT["sigma"]}, square=0.1)
@@ -215,148 +170,88 @@ def test_points_become_squares_that_every_mesh_reader_keeps(tmp_path):
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     np.testing.assert_allclose(across, [[0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]], atol=1e-5)
-    sigma = mesh.vertex_attributes["_SIGMA"] if "_SIGMA" in mesh.vertex_attributes else mesh.vertex_attributes["_sigma"]
-    np.testing.assert_allclose(sigma.ravel(), np.repeat(ABOUT["sigma"][KEPT], 4))
-
-
-def test_open3d_keeps_the_squares(tmp_path):
-    open3d = pytest.importorskip("open3d")
-    write_glb(tmp_path / "map.glb", [Shape("cloud", XYZ, RGB, square=0.1)], up=(0, 1, 0))
-    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "map.glb"))
-    assert len(mesh.triangles) == 6
-    centre = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(3, 6, 3)[:, [0, 1, 2, 5]].mean(1)
-    np.testing.assert_allclose(centre, XYZ[KEPT], atol=1e-6)
+    (arrays,) = read_glb(tmp_path / "map.glb")[1]
+    same(arrays["_SIGMA"], np.repeat(ABOUT["sigma"][KEPT], 4))
 
 
 # ------------------------------------------------------------------------------------------------------------- COLMAP
 
-LENSES = {
-    "PINHOLE": None,
-    "OPENCV": [0.1, -0.05, 0.002, -0.001],
-    "FULL_OPENCV": [0.1, -0.05, 0.002, -0.001, 0.01, 0.02, -0.01, 0.003],
-}
+
+def rotation(quaternion: Sequence[float]) -> Array:
+    """w, x, y, z -> (3, 3)."""
+    w, *v = quaternion
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + 2 * w * K + 2 * K @ K
 
 
-def model(lens, n=40, seed=0):
-    """Two shots of some points, observed exactly."""
-    generator = torch.Generator().manual_seed(seed)
-    draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    k = None if lens is None else torch.tensor([lens], dtype=torch.float64)
-    camera = Camera(torch.tensor([[520.0, 510.0]]).double(), torch.tensor([[319.5, 231.25]]).double(), k)
-    poses = [se3.exp((0.4 * draw(1, 6) - 0.2) * scale) for scale in (1.0, 1.5)]
-    shots = [ColmapImage(f"{i}.png", camera, (480, 640), T) for i, T in enumerate(poses)]
-    xyz = torch.cat((3 * draw(n, 2) - 1.5, 2 + 2 * draw(n, 1)), -1)
-    uv = torch.stack(
-        [cameras.project(camera, se3.apply(se3.invert(s.T_world_from_cam), xyz[None]))[0] for s in shots], 1
-    )
-    seen = torch.tensor([[0, 1]]).expand(n, 2).clone()
-    return shots, xyz, draw(n, 3), 0.1 * draw(n), seen, uv
+def lines_of(file: Path) -> list[str]:
+    return [line for line in file.read_text().split("\n")[:-1] if not line.startswith("#")]
 
 
-@pytest.mark.parametrize("name", LENSES)
-def test_colmap_sees_every_point_where_we_do(tmp_path, name):
-    pycolmap = pytest.importorskip("pycolmap")
-    shots, xyz, rgb, error, seen, uv = model(LENSES[name])
-    seen[3, 1], xyz[5, 0] = -1, math.nan
-    write_colmap(tmp_path, shots, xyz, rgb=rgb, error=error, seen_by=seen, uv=uv)
-    found = pycolmap.Reconstruction(str(tmp_path))
-    assert len(found.cameras) == 1 and len(found.images) == 2 and len(found.points3D) == 39
-    (camera,) = found.cameras.values()
-    assert camera.model_name == name and (camera.width, camera.height) == (640, 480)
-    assert camera.principal_point_x == pytest.approx(320.0) and camera.principal_point_y == pytest.approx(231.75)
-    worst = 0.0
-    for image in found.images.values():
-        for point in image.points2D:
-            if point.has_point3D():
-                at = camera.img_from_cam(image.cam_from_world() * found.points3D[point.point3D_id].xyz)
-                worst = max(worst, float(np.abs(at - point.xy).max()))
-    assert worst < 1e-4, "half a pixel, the lens and the pose are as COLMAP has them"
-    first = found.points3D[1]
-    np.testing.assert_allclose(first.xyz, xyz[0], atol=1e-8)
-    assert first.error == pytest.approx(float(error[0])) and first.track.length() == 2
-    assert found.points3D[4].track.length() == 1 and np.abs(first.color - 255 * rgb[0].numpy()).max() <= 0.5
+def test_a_colmap_model_holds_every_number(tmp_path: Path) -> None:
+    """Both cameras in two frames, the first of them once more; points are seen by some of the frames, and tracks lead back
+    to their observations."""
+    where = [*((camera, 1, i) for camera in (0, 1) for i in (2, 5)), (0, 1, 2)]
+    frames = [known.frame(*each) for each in where]
+    shots = [
+        ColmapImage(f"{k}.png", frame.camera, HW, frame.T_world_from_cam, known.time(*at))
+        for k, (frame, at) in enumerate(zip(frames, where, strict=True))
+    ]
+    points, uv = colmap_points()
+    write_colmap(tmp_path, shots, **points)
 
-
-def test_colmap_files_have_two_lines_a_picture_and_few_cameras(tmp_path):
-    shots, xyz, *columns = model(None)
-    points = dict(zip(("rgb", "error", "seen_by", "uv"), columns, strict=True))
-    other = shots[1].camera.replace(f=shots[1].camera.f * 2)
-    write_colmap(tmp_path, [*shots, ColmapImage("2.png", other, (480, 640), shots[0].T_world_from_cam)], xyz, **points)
-    lines = lambda name: [x for x in (tmp_path / name).read_text().split("\n")[:-1] if not x.startswith("#")]  # noqa: E731
-    assert len(lines("cameras.txt")) == 2 and len(lines("images.txt")) == 6 and len(lines("points3D.txt")) == 40
-    assert lines("images.txt")[5] == "", "a picture that sees nothing still has its line"
-    with pytest.raises(ValueError, match="seen_by names shot 7, expected at most 1"):
-        write_colmap(tmp_path, shots, xyz, **points | {"seen_by": points["seen_by"] * 0 + 7})
-    with pytest.raises(ValueError, match=r"uv has shape \(40, 2, 1\)"):
-        write_colmap(tmp_path, shots, xyz, **points | {"uv": points["uv"][..., :1]})
+    cameras = {int(w[0]): w[1:] for w in map(str.split, lines_of(tmp_path / "cameras.txt"))}
+    images = lines_of(tmp_path / "images.txt")
+    observed: dict[int, list[list[float]]] = {}
+    assert len(images) == 10 and images[9] == "" and len(cameras) == 4, "a picture that sees nothing still has its line"
+    times = dict(map(str.split, lines_of(tmp_path / "times.txt")))
+    for k, at in enumerate(where):
+        words = images[2 * k].split()
+        assert int(words[0]) == k + 1 and words[9] == f"{k}.png" and float(times[words[0]]) == known.time(*at)
+        T = np.linalg.inv(known.pose(*at))
+        same(rotation([float(x) for x in words[1:5]]), T[:3, :3], 1e-8)
+        same([float(x) for x in words[5:8]], T[:3, 3], 1e-8)
+        model, *numbers = cameras[int(words[8])]
+        K = known.intrinsics(*at)
+        lens = (*LENS, 0, 0, 0) if at[0] else ()
+        assert model == ("FULL_OPENCV" if at[0] else "PINHOLE")
+        same([float(x) for x in numbers], [HW[1], HW[0], *K[[0, 1], [0, 1]], *(K[:2, 2] + 0.5), *lens], 1e-7)
+        values = [float(x) for x in images[2 * k + 1].split()]
+        observed[k + 1] = np.reshape(values, (-1, 3)).tolist()
+    rows = [line.split() for line in lines_of(tmp_path / "points3D.txt")]
+    kept = np.flatnonzero(np.isfinite(points["xyz"]).all(1))
+    assert [int(row[0]) for row in rows] == list(range(1, len(kept) + 1))
+    for row, p in zip(rows, kept, strict=True):
+        same([float(x) for x in row[1:4]], points["xyz"][p], 1e-8)
+        assert [int(x) for x in row[4:7]] == points["rgb"][p].tolist()
+        assert float(row[7]) == pytest.approx(points["error"][p])
+        track = np.reshape([int(x) for x in row[8:]], (-1, 2)).tolist()
+        seen = points["seen_by"][p]
+        want = [(shot, uv[p, k]) for k, shot in enumerate(seen) if shot >= 0 and np.isfinite(uv[p, k]).all()]
+        assert [image for image, _ in track] == [shot + 1 for shot, _ in want]
+        for (image, place), (_, pixel) in zip(track, want, strict=True):
+            same(observed[image][place], [*(pixel + 0.5), int(row[0])], 1e-7)
+    assert sum(map(len, observed.values())) == sum(len(row[8:]) // 2 for row in rows) > 20
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.3, 0.8), (0, 0, 0)])
 @pytest.mark.parametrize("angle", [1e-9, 0.5, math.pi - 1e-9, math.pi, -3.0])
-def test_quaternions_of_all_turns(tmp_path, axis, angle):
+def test_quaternions_and_lenses_of_four_coefficients(tmp_path: Path, axis: Sequence[float], angle: float) -> None:
     way = torch.tensor([*axis], dtype=torch.float64)
     way = way / way.norm().clamp_min(1e-12) * angle
     T = se3.exp(torch.cat((way, torch.zeros(3).double()))[None])  # of the world in the camera, as COLMAP writes it
-    (shot, _), *points = model(None, n=1)
-    (row,) = written(tmp_path, ColmapImage("1.png", shot.camera, shot.hw, se3.invert(T)), *points)
-    w, *v = map(float, row.split()[1:5])
-    q = torch.tensor(v, dtype=torch.float64)
-    K = se3.hat(q)
-    again = torch.eye(3).double() + 2 * w * K + 2 * K @ K
-    torch.testing.assert_close(again, T.R[0], atol=1e-9, rtol=0)
+    camera = Camera(
+        torch.tensor([[520.0, 510.0]]), torch.tensor([[319.5, 231.25]]), torch.tensor([[0.5, -0.25, 0.0, 1.0]])
+    )
+    none = {"rgb": np.zeros((0, 3)), "error": np.zeros(0), "seen_by": np.zeros((0, 1)), "uv": torch.zeros(0, 1, 2)}
+    write_colmap(tmp_path, [ColmapImage("1.png", camera, (480, 640), se3.invert(T))], np.zeros((0, 3)), **none)
+    assert lines_of(tmp_path / "cameras.txt") == ["1 OPENCV 640 480 520 510 320 231.75 0.5 -0.25 0 1"]
+    w, *v = map(float, lines_of(tmp_path / "images.txt")[0].split()[1:5])
+    same(rotation((w, *v)), T.R[0], 1e-9)
     assert w >= 0
 
 
-def written(folder, shot, xyz, rgb, error, seen, uv):
-    """The line of every picture of a model with one picture."""
-    write_colmap(folder, [shot], xyz, rgb=rgb, error=error, seen_by=seen[:, :1], uv=uv[:, :1])
-    lines = [x for x in (folder / "images.txt").read_text().splitlines() if not x.startswith("#")]
-    return lines[::2]
-
-
-def test_a_track_names_the_observation_of_its_point(tmp_path):
-    """POINT2D_IDX counts from 0 among the observations of its image, IMAGE_ID and POINT3D_ID from 1."""
-    shots, xyz, rgb, error, seen, uv = model(None, n=12)
-    seen[0, 0], seen[3, 1], xyz[5, 0] = -1, -1, math.nan
-    write_colmap(tmp_path, shots, xyz, rgb=rgb, error=error, seen_by=seen, uv=uv)
-    lines = {
-        name: [x for x in (tmp_path / name).read_text().split("\n")[:-1] if not x.startswith("#")]
-        for name in ("images.txt", "points3D.txt")
-    }
-    observed = {
-        int(head.split()[0]): [tuple(row.split()[k : k + 3]) for k in range(0, len(row.split()), 3)]
-        for head, row in zip(lines["images.txt"][::2], lines["images.txt"][1::2], strict=True)
-    }
-    assert sorted(observed) == [1, 2] and [len(observed[k]) for k in (1, 2)] == [10, 10]
-    for image, rows in observed.items():
-        kept = [p for p in range(12) if p != 5 and seen[p, image - 1] >= 0]
-        written_uv = np.array([[float(u), float(v)] for u, v, _ in rows])
-        assert np.allclose(written_uv, uv[kept, image - 1].numpy() + 0.5, atol=1e-6)
-    (camera,) = [x for x in (tmp_path / "cameras.txt").read_text().split("\n")[:-1] if not x.startswith("#")]
-    assert camera.split() == ["1", "PINHOLE", "640", "480", "520", "510", "320", "231.75"]
-    assert [line.split()[8] for line in lines["images.txt"][::2]] == ["1", "1"]
-    named = set()
-    for line in lines["points3D.txt"]:
-        number, track = line.split()[0], line.split()[8:]
-        for image, place in zip(map(int, track[::2]), map(int, track[1::2]), strict=True):
-            assert observed[image][place][2] == number
-            named.add((image, place))
-    assert named == {(image, place) for image in observed for place in range(10)}
-
-
-def test_a_frame_of_nerfstudio_has_its_lens_pose_and_centre():
-    K, T = np.array([[50.0, 0, 20], [0, 60, 10], [0, 0, 1]]), np.eye(4)
-    T[:3, 3] = 1, 2, 3
-    shot = nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T, (0.1, -0.2, 0.01, 0.02, 0.3), 4.5)
-    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "timestamp", "k1", "k2", "p1", "p2", "k3")
-    assert [shot[name] for name in names] == [50, 60, 20.5, 10.5, 40, 30, 4.5, 0.1, -0.2, 0.01, 0.02, 0.3]
-    assert shot["transform_matrix"] == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]
-    assert not {"k1", "timestamp"} & set(nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T))
-    with pytest.raises(ValueError, match="found 6 distortion coefficients"):
-        nerfstudio.make_nerfstudio_frame("a", (30, 40), K, T, (0, 0, 0, 0, 0, 0.1))
-
-
-def test_depth_and_confidence_of_nerfstudio_are_steps_of_a_millimetre_and_a_share():
+def test_depth_and_confidence_of_nerfstudio_are_steps_of_a_millimetre_and_a_share() -> None:
     depth = np.array([[0.0, 0.0004, 0.0006, 1.2344, 65.534, 65.535, 65.536]])
     assert nerfstudio.quantise_nerfstudio_depth(depth).tolist() == [[0, 0, 1, 1234, 65534, 0, 0]]
     sigma = np.array([[1.0, 0.1, 0.2, 0.0, 1000.0]])

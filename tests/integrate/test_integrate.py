@@ -4,7 +4,6 @@ import math
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from support.box_scene import BOX, HW, off_wall, walk
@@ -27,7 +26,6 @@ from dhtorch.integrate import (
     splat_points,
     sweeps,
 )
-from dhtorch.pytree import collate
 from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
 from dhtorch.stages.holes import classify
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -49,10 +47,6 @@ def wall(z=2.0, sigma=0.01, colour=0.5, hw=(60, 80)):
     depth = torch.full((1, *hw), z)
     features = torch.full((1, *hw, 1), colour)
     return DepthView(depth, torch.full_like(depth, sigma), features, camera, se3.identity(1, depth))
-
-
-def height(surface):
-    return float(surface.xyz[:, 2].mean())
 
 
 @pytest.fixture(scope="module")
@@ -93,17 +87,6 @@ def test_a_mesh_faces_the_open_side_and_has_no_seams(box):
     assert len(main.faces) > 0.95 * len(surface.face), "bricks are joined"
 
 
-def test_colours_are_those_of_the_pictures(box):
-    surface = extract_points(box)
-    tone = [
-        torch.sin(3 * surface.xyz[:, 0] + 1),
-        torch.sin(4 * surface.xyz[:, 1] - surface.xyz[:, 0]),
-        torch.sin(5 * surface.xyz[:, 2]),
-    ]
-    error = (surface.features - (torch.stack(tone, -1) * 0.5 + 0.5)).abs()
-    assert float(error.median()) < 0.02 and float(error.quantile(0.95)) < 0.08
-
-
 def seen_from_four_places(hw, voxel):
     """Exact depth of the built-in room: recording, volume, all that was seen."""
     source = SyntheticRoom(lidar="exact", hw=hw, supersample=1)
@@ -142,149 +125,13 @@ def test_the_furnished_room_is_found_exactly_and_completely_and_nothing_where_no
     assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
 
 
-def test_open3d_finds_the_same_surface():
-    o3d = pytest.importorskip("open3d")
-    pytest.importorskip("skimage")
-    spatial = pytest.importorskip("scipy.spatial")
-    walk_through, volume, _ = seen_from_four_places((240, 320), 0.02)
-    theirs = o3d.pipelines.integration.UniformTSDFVolume(
-        length=5.12,
-        resolution=256,
-        sdf_trunc=0.08,
-        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
-        origin=np.array([-2.81, -2.81, -0.61]),  # its voxels' centres on ours
-    )
-    for i in (0, 3, 6, 9):
-        frame = walk_through[i]
-        (fx, fy), (cx, cy) = frame.camera.f[0].tolist(), frame.camera.c[0].tolist()
-        depth = o3d.geometry.Image(frame.depth[0].numpy())
-        picture = o3d.geometry.Image(frame.image[0].permute(1, 2, 0).contiguous().numpy())
-        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(picture, depth, 1.0, 10.0, False)
-        lens = o3d.camera.PinholeCameraIntrinsic(320, 240, fx, fy, cx, cy)
-        theirs.integrate(rgbd, lens, np.linalg.inv(se3.to_matrix(walk_through.true_poses[i : i + 1])[0].numpy()))
-    other = np.asarray(theirs.extract_triangle_mesh().vertices)
-    surface = extract_mesh(volume)
-    ours = surface.xyz.numpy()
-    there, back = spatial.cKDTree(other).query(ours)[0], spatial.cKDTree(ours).query(other)[0]
-    assert np.median(there) < 1e-4 and np.quantile(there, 0.9) < 0.002 and np.quantile(there, 0.99) < 0.01
-    assert np.median(back) < 1e-4 and (back < 0.02).mean() > 0.9, "they keep rims that we leave out"
-    assert room_distance(surface.xyz).mean() < room_distance(torch.from_numpy(other)).mean()
-
-
 # ------------------------------------------------------------------------------------------------------------- blending
-
-
-def test_overlap_is_blended_by_precision_and_order_does_not_matter():
-    near, far = wall(2.00, sigma=0.01), wall(2.03, sigma=0.02)
-    one = fuse_views(fuse_views(make_volume(0.02, channels=1), near), far)
-    other = fuse_views(fuse_views(make_volume(0.02, channels=1), far), near)
-    expected = (2.00 * 4 + 2.03) / 5
-    assert height(extract_points(one)) == pytest.approx(expected, abs=0.002)
-    assert height(extract_points(other)) == pytest.approx(height(extract_points(one)), abs=1e-5)
-    sigma = extract_points(one).sigma
-    assert float(sigma.median()) == pytest.approx(1 / math.sqrt(1 / 0.01**2 + 1 / 0.02**2), rel=0.05)
-
-
-def test_overlap_is_blended_by_confidence_where_that_is_the_weight():
-    """The score is the last feature; sigma, which says the opposite here, does not count."""
-    near, far = wall(2.00, sigma=0.02, colour=0.8), wall(2.03, sigma=0.01, colour=0.2)
-
-    def fused(*views):
-        volume = make_volume(0.02, channels=1)
-        for each in views:
-            volume = fuse_views(volume, each, weight="confidence")
-        return extract_points(volume)
-
-    expected = (2.00 * 0.8 + 2.03 * 0.2) / (0.8 + 0.2)
-    assert height(fused(near, far)) == pytest.approx(expected, abs=0.002)
-    assert height(fused(far, near)) == pytest.approx(height(fused(near, far)), abs=1e-5)
-    assert len(fused(near, wall(2.03, colour=0.0)).xyz) and not len(fused(wall(2.03, colour=0.0)).xyz)
-    assert float(fused(near, far).sigma.median()) == pytest.approx(0.02, rel=0.05), "voxel / sqrt(sum of confidences)"
-
-
-def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
-    both = collate([wall(2.0), wall(2.02)])
-    together = fuse_views(make_volume(0.02, channels=1), both)
-    apart = fuse_views(fuse_views(make_volume(0.02, channels=1), wall(2.0)), wall(2.02))
-    again = fuse_views(make_volume(0.02, channels=1), both)
-    for name in ("key", "distance", "weight", "features"):
-        assert torch.equal(getattr(together, name), getattr(again, name)), "the same every time"
-    at, found = sparse_grid.find_cells(together.key, apart.key)
-    assert bool(found.all())
-    known = apart.weight.sum(-1) > 0
-    torch.testing.assert_close(together.distance[at][known], apart.distance[known], atol=0.02, rtol=0)
-
-
-def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
-    sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02, Source.FILLED: 0.025}
-    volume = make_volume(0.02, channels=1)
-    for code, sigma in sigmas.items():
-        volume = fuse_views(volume, wall(2.0, sigma=sigma), source=code)
-    assert set(extract_points(volume).source.tolist()) == {Source.SENSOR}
-    assert volume.weight.amax((0, 1)).tolist() == pytest.approx([sigma**-2 for sigma in sigmas.values()], rel=1e-4)
-    for code in sigmas:
-        alone = fuse_views(make_volume(0.02, channels=1), wall(2.0, sigma=0.02), source=code)
-        assert set(extract_points(alone).source.tolist()) == {code}
-        assert height(extract_points(alone)) == pytest.approx(2.0, abs=1e-3)
-
-
-def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
-    """Answers 20 cm apart of sigma 10 cm are one wall between them, not two, nor the farther one alone."""
-    volume = make_volume(0.02, channels=1)
-    for z in (2.9, 3.1, 2.95, 3.05):
-        volume = fuse_views(volume, wall(z, sigma=0.1), source=Source.RECOVERED)
-    z = extract_points(volume).xyz[:, 2]
-    assert float((z - 3.0).abs().quantile(0.9)) < 0.05
 
 
 # -------------------------------------------------------------------------------------------------------------- carving
 
 
-def hovering(volume):
-    """Points of a surface that hangs in front of a wall at 2.5 m."""
-    return int((extract_points(volume).xyz[:, 2] < 2.2).sum())
-
-
-def test_rays_that_end_behind_carve_away_what_was_wrong():
-    ghost, truth = wall(2.0, sigma=0.05), wall(2.5, sigma=0.01)
-    before = fuse_views(make_volume(0.02, channels=1), ghost, source=Source.RECOVERED)
-    assert hovering(before) > 1000
-    assert hovering(fuse_views(before, truth)) == 0
-    assert hovering(fuse_views(before, truth, carve=False)) > 1000
-
-
-def test_carving_follows_answered_rays_only():
-    truth = wall(2.5)
-    depth = truth.depth.clone()
-    depth[..., :40] = 0  # no answer on the left
-    volume = fuse_views(fuse_views(make_volume(0.02, channels=1), wall(2.0, sigma=0.05)), truth.replace(depth=depth))
-    left = extract_points(volume).xyz[:, 0] < -0.03
-    z = extract_points(volume).xyz[:, 2]
-    assert bool((z[left] < 2.2).any()) and not bool((z[~left & (extract_points(volume).xyz[:, 0] > 0.03)] < 2.2).any())
-    assert float(z[left].min()) == pytest.approx(2.0, abs=0.01), "unchanged, where nobody looked"
-
-
 # -------------------------------------------------------------------------------------------------------------- splats
-
-
-def test_sparse_answers_become_patches_of_surface():
-    uv = torch.tensor([[[20.0, 30.0], [60.0, 30.0], [61.0, 30.0], [5.0, 5.0], [70.0, 50.0]]])
-    depth = torch.tensor([[2.0, 3.0, 1.5, math.nan, 2.0]])
-    sigma = torch.tensor([[0.02, 0.02, 0.02, 0.02, math.nan]])
-    features = torch.arange(5.0).view(1, 5, 1)
-    camera = wall().camera
-    one = splat_points(camera, (60, 80), uv, depth, sigma, features, T_world_from_cam=se3.identity(1, uv), radius=0.06)
-    assert one.depth.shape == (1, 60, 80) and one.features.shape == (1, 60, 80, 1)
-    assert (
-        float(one.depth[0, 30, 20]) == 2.0 and float(one.depth[0, 30, 23]) == 2.0 and float(one.depth[0, 30, 24]) == 0
-    )
-    assert float(one.depth[0, 30, 60]) == 1.5 and float(one.features[0, 30, 60]) == 2.0, "the nearer one covers"
-    assert set(one.depth.unique().tolist()) == {0.0, 1.5, 2.0}
-    volume = fuse_views(make_volume(0.02, channels=1), one, source=Source.RECOVERED)
-    surface = extract_points(volume)
-    where = cameras.unproject(camera, uv[:, [0, 2]], depth[:, [0, 2]])[0]
-    nearest = torch.cdist(surface.xyz, where).amin(1)
-    assert len(surface.xyz) > 10 and float(nearest.max()) < 0.06 + 2 * 0.02, "no more than the disc is claimed"
 
 
 def no_points(camera, n=0, wrong=0):

@@ -15,7 +15,6 @@ from dhtorch.integrate.level import (
     _UP_BY_FORMAT,
     _fit_floor_normal,
     _fit_upright_direction,
-    _spiral_directions,
     estimate_up,
     mean_camera_up,
 )
@@ -128,12 +127,3 @@ def test_a_map_is_in_the_recordings_world_if_a_frame_of_it_is_there():
     turned = se3.exp(torch.tensor([[torch.pi / 2, 0, 0, 0, 0, 0]]).double())
     assert mean_camera_up([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
     assert mean_camera_up([]).tolist() == [0, -1, 0]
-
-
-def test_directions_are_spread_evenly():
-    found = _spiral_directions(2000)
-    torch.testing.assert_close(found.norm(dim=-1), torch.ones(2000, dtype=torch.float64))
-    torch.testing.assert_close(found.T @ found / 2000, torch.eye(3).double() / 3, atol=2e-3, rtol=0)
-    assert found.mean(0).norm() < 2e-3
-    nearest = (found @ found.T).fill_diagonal_(-1).amax(1).clamp(-1, 1).acos()
-    assert nearest.max() < 1.6 * nearest.median()

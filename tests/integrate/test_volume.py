@@ -10,6 +10,7 @@ import torch
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.integrate import DepthView, extract_points, fuse_views, make_volume, recording, splat_points
 from dhtorch.integrate.volume import VOLUME_SOURCES, Volume, reserve_blocks
+from dhtorch.pytree import collate
 from dhtorch.records import Camera, Frame
 
 CAMERA = Camera(torch.tensor([[22.0, 18.0]]), torch.tensor([[10.5, 6.25]]))
@@ -32,7 +33,7 @@ def voxels(volume):
     return sparse_grid.unpack_cells(volume.key)[:, None] * 8 + local
 
 
-def loop_fuse(volume, looks, max_reach=3.0, carve=True):
+def loop_fuse(volume, looks, max_reach, carve, weighting):
     """What ``looks`` (view, index of the source of each pixel) leave at every voxel: distance, weights, swept surfaces,
     share with colour, colour, whether it is sure which pixel it reads: not on a border of two, nor beyond the middle of the outermost."""
     place = voxels(volume).reshape(-1, 3).double().numpy() * volume.voxel
@@ -60,7 +61,8 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
             if ahead <= -reach or (not carve and ahead > reach):
                 continue
             source = sources[v, u]
-            w = min(1.0, max(0.0, 2 + 2 * ahead / reach)) / sigma**2
+            precision = 1 / sigma**2 if weighting == "variance" else float(view.features[0, v, u, -1]) / volume.voxel**2
+            w = min(1.0, max(0.0, 2 + 2 * ahead / reach)) * precision
             total = weight[k].sum() + w
             share = w / total if total else 0.0
             distance[k] += share * (min(max(ahead, -tau), tau) - distance[k])
@@ -73,29 +75,35 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
 
 
 @pytest.mark.parametrize(
-    ("carve", "max_reach", "sigma"),
-    [pytest.param(True, 3.0, 0.02, marks=pytest.mark.slow), (False, 3.0, 0.15), (True, 1.2, 0.15)],
+    ("carve", "max_reach", "sigma", "weighting"),
+    [
+        pytest.param(True, 3.0, 0.02, "variance", marks=pytest.mark.slow),
+        (False, 3.0, 0.15, "variance"),
+        (True, 1.2, 0.15, "confidence"),
+    ],
 )
-def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
+def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma, weighting):
+    """A batch of views is fused as one after the other."""
     volume = make_volume(0.1, truncation=0.25, channels=2)
     index = [*(np.full(HW, k) for k in range(3)), 2 + np.indices(HW).sum(0) % 2]
     views = [looked(0), looked(1, sigma, far=1.7), looked(2, sigma), looked(3)]
-    which = [*VOLUME_SOURCES[:3], torch.tensor(VOLUME_SOURCES)[torch.from_numpy(index[3])][None]]
-    for view, source in zip(views, which, strict=True):
-        volume = fuse_views(volume, view, source=source, carve=carve, max_reach=max_reach)
-    # what was said before a block was there is not known to it: ask again, now that all blocks are
-    blank = volume.replace(
-        **{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "n_swept", "features")}
-    )
-    for view, source in zip(views, which, strict=True):
-        blank = fuse_views(blank, view, source=source, carve=carve, max_reach=max_reach)
+    codes = torch.tensor(VOLUME_SOURCES)[torch.from_numpy(np.stack(index))]
+    options = {"carve": carve, "max_reach": max_reach, "weight": weighting}
+    # what was said before a block was there is not known to it: the second time all blocks are
+    for _ in range(2):
+        volume = volume.replace(
+            **{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "n_swept", "features")}
+        )
+        volume = fuse_views(volume, views[0], source=VOLUME_SOURCES[0], **options)
+        volume = fuse_views(volume, collate(views[1:3]), source=codes[1:3], **options)
+        volume = fuse_views(volume, views[3], source=codes[3:], **options)
     looks = zip(views, index, strict=True)
-    distance, weight, swept, coloured, colour, sure = loop_fuse(blank, looks, max_reach, carve)
+    distance, weight, swept, coloured, colour, sure = loop_fuse(volume, looks, max_reach, carve, weighting)
     assert sure.mean() > 0.8 and (weight[sure] > 0).any(0).all() and (weight[sure].sum(-1) == 0).any()
-    features = blank.features.flatten(0, 1).numpy()[sure]
-    assert (blank.n_swept.flatten().numpy()[sure] == swept[sure]).mean() > 0.999 and set(swept[sure]) == {0, 1, 2}
-    np.testing.assert_allclose(blank.weight.flatten(0, 1).numpy()[sure], weight[sure], rtol=2e-3, atol=0.05)
-    np.testing.assert_allclose(blank.distance.flatten().numpy()[sure], distance[sure], atol=1e-4)
+    features = volume.features.flatten(0, 1).numpy()[sure]
+    assert (volume.n_swept.flatten().numpy()[sure] == swept[sure]).mean() > 0.999 and set(swept[sure]) == {0, 1, 2}
+    np.testing.assert_allclose(volume.weight.flatten(0, 1).numpy()[sure], weight[sure], rtol=2e-3, atol=0.05)
+    np.testing.assert_allclose(volume.distance.flatten().numpy()[sure], distance[sure], atol=1e-4)
     np.testing.assert_allclose(features[:, 0], coloured[sure], atol=4e-3)
     np.testing.assert_allclose(features[:, 1:], colour[sure], atol=4e-3)
 

@@ -10,14 +10,12 @@ import base64
 import io
 import itertools
 import json
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
@@ -28,11 +26,11 @@ from pyarrow import parquet
 from support import known_episodes as known
 from support import stored_outputs, writers
 from support.known_episodes import CAMERAS, FPS, HW, LENGTHS, LENS, TASKS
+from support.read_back import Array, linear, read_glb, read_ply, same
 from support.writers.simulator_hdf5 import write_simulator_hdf5
 
 from dhtorch.cli.run import main
 from dhtorch.codes import Gate, Hole, Source
-from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
 from dhtorch.viz.viewer import html
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud, SweptPointCloud
 
@@ -42,8 +40,6 @@ FEW = ["method=paper", "method.n=64", "method.hypotheses=10"]
 ENRICH = [*FEW, "gap=0", "dense={size: 64, planes: 8}", "shard_rows=4", "report=false"]
 #: Quantisation of enrich's depth and sigma, m, and the sensor's relative standard deviation.
 STEP, SIGMA_STEP, SIGMA_REL = 2.0**-10, 2.0**-13, 0.01
-
-Array = np.ndarray
 
 
 def enrich(source: Path, out: Path, *more: str) -> Path:
@@ -80,10 +76,6 @@ def read_lines(file: Path) -> list[Any]:
 def video(file: Path) -> Array:
     with av.open(str(file)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
-
-
-def same(value: Any, want: Any, tolerance: float = 0.0) -> None:
-    np.testing.assert_allclose(np.asarray(value, np.float64), np.asarray(want, np.float64), rtol=0, atol=tolerance)
 
 
 def hold(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -441,147 +433,7 @@ def check_tokens(row: dict[str, Any], u: Array, v: Array, valid: Array) -> None:
         same(token, want, 1e-5)
 
 
-# --------------------------------------------------------------------------------------------------------- writers
-
-
-def read_ply(file: Path) -> Array:
-    """Vertices of a PLY file."""
-    plyfile = pytest.importorskip("plyfile")
-    data = plyfile.PlyData.read(file)
-    assert not data.text and data.byte_order == "<"
-    return data["vertex"].data
-
-
-def read_glb(file: Path) -> tuple[list[Any], list[dict[str, Array]]]:
-    """Nodes, and the arrays of every mesh by attribute."""
-    data = file.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
-
-    def array(k: int) -> Array:
-        accessor = document["accessors"][k]
-        view = document["bufferViews"][accessor["bufferView"]]
-        width = {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
-        dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
-        values = np.frombuffer(body, dtype, accessor["count"] * width, view["byteOffset"])
-        return values.reshape(-1, width) if width > 1 else values
-
-    meshes = []
-    for mesh in document["meshes"]:
-        (primitive,) = mesh["primitives"]
-        arrays = {name: array(k) for name, k in primitive["attributes"].items()}
-        meshes.append(arrays | ({"indices": array(primitive["indices"])} if "indices" in primitive else {}))
-    return document["nodes"], meshes
-
-
-def linear(rgb: Array) -> Array:
-    """sRGB of 8 bits -> linear."""
-    x = rgb / 255
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def drawn(n: int, seed: int = 0) -> dict[str, Array]:
-    """Points with distinct numbers, one of them without a place."""
-    draw = np.random.default_rng(seed)
-    xyz = draw.uniform(-2, 2, (n, 3)) + np.array([0, 0, 4])
-    xyz[1, 2] = np.nan
-    numbers = {"sigma": draw.uniform(0.01, 0.1, n), "score": draw.random(n)}
-    codes = {"source": draw.integers(0, 6, n), "hole": draw.integers(0, 5, n)}
-    return {"xyz": xyz, "rgb": draw.integers(0, 256, (n, 3)).astype(np.uint8), **numbers, **codes}
-
-
-def test_ply_and_glb_hold_every_column(tmp_path: Path) -> None:
-    points = drawn(9)
-    kept = np.isfinite(points["xyz"]).all(1)
-    normal = np.roll(np.nan_to_num(points["xyz"]), 1, 1)
-    face = np.array([[0, 2, 3], [1, 4, 5], [8, 6, 7]])  # of which one has a corner that is left out
-    values = {name: points[name] for name in ("sigma", "score", "source", "hole")}
-    n = write_ply(tmp_path / "a.ply", points["xyz"], points["rgb"], normal=normal, face=face, **values)
-    vertex = read_ply(tmp_path / "a.ply")
-    want = {**dict(zip("xyz", points["xyz"].T, strict=True)), **dict(zip(("nx", "ny", "nz"), normal.T, strict=True))}
-    want |= dict(zip(("red", "green", "blue"), points["rgb"].T, strict=True))
-    want |= {"sigma": points["sigma"], "score": points["score"], "quality": points["sigma"]}
-    want |= {"source": points["source"], "class": points["hole"]}
-    assert n == len(vertex) == 8 and {*vertex.dtype.names} == {*want}
-    for name, column in want.items():
-        same(vertex[name], column[kept], 1e-6)
-    tail = (tmp_path / "a.ply").read_bytes()[-26:]
-    assert [struct.unpack_from("<Biii", tail, 13 * k) for k in range(2)] == [(3, 0, 1, 2), (3, 7, 5, 6)]
-
-    shapes = [
-        Shape("left", points["xyz"], points["rgb"], normal, face, {"sigma": points["sigma"]}),
-        Shape("right", points["xyz"] + 10, points["rgb"][::-1].copy()),
-    ]
-    write_glb(tmp_path / "a.glb", shapes, up=(0.0, 1.0, 0.0))
-    nodes, meshes = read_glb(tmp_path / "a.glb")
-    assert [node["name"] for node in nodes] == ["left", "right"] and all(node["rotation"][3] == 1 for node in nodes)
-    for mesh, shift, rgb in zip(meshes, (0, 10), (points["rgb"], points["rgb"][::-1]), strict=True):
-        same(mesh["POSITION"], points["xyz"][kept] + shift, 1e-5)
-        same(mesh["COLOR_0"], linear(rgb[kept]), 1e-6)
-    same(meshes[0]["NORMAL"], (normal / np.linalg.norm(normal, axis=1, keepdims=True))[kept], 1e-6)
-    same(meshes[0]["_SIGMA"], points["sigma"][kept], 1e-7)
-    assert meshes[0]["indices"].tolist() == [0, 1, 2, 7, 5, 6] and "indices" not in meshes[1]
-
-
-def rotation(quaternion: Sequence[float]) -> Array:
-    """w, x, y, z -> (3, 3)."""
-    w, *v = quaternion
-    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + 2 * w * K + 2 * K @ K
-
-
-def lines_of(file: Path) -> list[str]:
-    return [line for line in file.read_text().split("\n")[:-1] if not line.startswith("#")]
-
-
-def test_a_colmap_model_holds_every_number(tmp_path: Path) -> None:
-    """Both cameras in two frames; points are seen by some of them, and tracks lead back to their observations."""
-    where = [(camera, 1, i) for camera in (0, 1) for i in (2, 5)]
-    frames = [known.frame(*each) for each in where]
-    shots = [
-        ColmapImage(f"{k}.png", frame.camera, HW, frame.T_world_from_cam, known.time(*at))
-        for k, (frame, at) in enumerate(zip(frames, where, strict=True))
-    ]
-    points, draw = drawn(20), np.random.default_rng(1)
-    seen = draw.permuted(np.tile(np.arange(4), (20, 1)), axis=1)
-    seen[draw.random((20, 4)) < 0.4] = -1
-    uv, error = draw.uniform(0, 40, (20, 4, 2)), draw.random(20)
-    uv[3, 2] = np.nan
-    write_colmap(tmp_path, shots, points["xyz"], rgb=points["rgb"], error=error, seen_by=seen, uv=torch.from_numpy(uv))
-
-    cameras = {int(w[0]): w[1:] for w in map(str.split, lines_of(tmp_path / "cameras.txt"))}
-    images = lines_of(tmp_path / "images.txt")
-    observed: dict[int, list[list[float]]] = {}
-    assert len(images) == 8 and len(cameras) == 4
-    times = dict(map(str.split, lines_of(tmp_path / "times.txt")))
-    for k, at in enumerate(where):
-        words = images[2 * k].split()
-        assert int(words[0]) == k + 1 and words[9] == f"{k}.png" and float(times[words[0]]) == known.time(*at)
-        T = np.linalg.inv(known.pose(*at))
-        same(rotation([float(x) for x in words[1:5]]), T[:3, :3], 1e-8)
-        same([float(x) for x in words[5:8]], T[:3, 3], 1e-8)
-        model, *numbers = cameras[int(words[8])]
-        K = known.intrinsics(*at)
-        lens = (*LENS, 0, 0, 0) if at[0] else ()
-        assert model == ("FULL_OPENCV" if at[0] else "PINHOLE")
-        same([float(x) for x in numbers], [HW[1], HW[0], *K[[0, 1], [0, 1]], *(K[:2, 2] + 0.5), *lens], 1e-7)
-        values = [float(x) for x in images[2 * k + 1].split()]
-        observed[k + 1] = np.reshape(values, (-1, 3)).tolist()
-    rows = [line.split() for line in lines_of(tmp_path / "points3D.txt")]
-    kept = np.flatnonzero(np.isfinite(points["xyz"]).all(1))
-    assert [int(row[0]) for row in rows] == list(range(1, len(kept) + 1))
-    for row, p in zip(rows, kept, strict=True):
-        same([float(x) for x in row[1:4]], points["xyz"][p], 1e-8)
-        assert [int(x) for x in row[4:7]] == points["rgb"][p].tolist() and float(row[7]) == pytest.approx(error[p])
-        track = np.reshape([int(x) for x in row[8:]], (-1, 2)).tolist()
-        want = [(shot, uv[p, k]) for k, shot in enumerate(seen[p]) if shot >= 0 and np.isfinite(uv[p, k]).all()]
-        assert [image for image, _ in track] == [shot + 1 for shot, _ in want]
-        for (image, place), (_, pixel) in zip(track, want, strict=True):
-            same(observed[image][place], [*(pixel + 0.5), int(row[0])], 1e-7)
-    assert sum(map(len, observed.values())) == sum(len(row[8:]) // 2 for row in rows) > 20
+# -------------------------------------------------------------------------------------------------------- viewer
 
 
 def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) -> None:

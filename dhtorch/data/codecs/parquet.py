@@ -96,28 +96,29 @@ def read_columns(
         raise FormatError(file, "data", error, "decodable columns") from None
 
 
-def read_cell(file: Path, column: str, row: int) -> Any:
-    """One value of a column; its row group is cached, so that neighbouring rows are not decoded again.
+def read_row(file: Path, columns: tuple[str, ...], row: int) -> dict[str, Any]:
+    """The values of a row; its row group is cached, so that neighbouring rows are not decoded again.
 
     Raises:
         FormatError: as :func:`read_columns`.
     """
     version = read_version(file)
-    starts = _cached_header(file, version).groups
+    starts = _cached_groups(file, version)
     if not 0 <= row < starts[-1]:
         raise FormatError(file, "rows", starts[-1], f"row {row}")
     group = int(np.searchsorted(starts, row, "right")) - 1
-    return _cached_rows(file, version, column, (starts[group], starts[group + 1]))[row - starts[group]]
+    values = _cached_rows(file, version, columns, (starts[group], starts[group + 1]))
+    return {name: values[name][row - starts[group]] for name in columns}
+
+
+@lru_cache(maxsize=1024)
+def _cached_groups(file: Path, _version: tuple[int, ...]) -> tuple[int, ...]:
+    return read_parquet_header(file).groups
 
 
 @lru_cache(maxsize=4)
-def _cached_header(file: Path, version: tuple[int, ...]) -> ParquetHeader:
-    return read_parquet_header(file)
-
-
-@lru_cache(maxsize=4)
-def _cached_rows(file: Path, version: tuple[int, ...], column: str, rows: tuple[int, int]) -> Any:
-    return read_columns(file, [column], rows)[column]
+def _cached_rows(file: Path, _version: tuple[int, ...], columns: tuple[str, ...], rows: tuple[int, int]) -> Any:
+    return read_columns(file, columns, rows)
 
 
 def _open_table(file: Path) -> tuple[Any, ParquetHeader]:
@@ -206,15 +207,38 @@ class _Chunk(NamedTuple):
 
 def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> None:
     """Raise FormatError where a chunk's pages, by their headers, unpack to more than the footer's size or the limit."""
-    chunks = _read_chunks(file, frozenset(groups))
-    total = 0
+    total, chunks = 0, _read_chunks(file, frozenset(groups))
     with open_regular(file) as stream:
         limit = max(_MAX_UNPACKED_BYTES, MAX_MEMORY_RATIO * stream.seek(0, 2))
         for chunk in chunks:
-            if any(chunk.path == name or chunk.path.startswith(f"{name}.") for name in columns):
-                total += _unpacked_chunk_bytes(file, stream, chunk)
+            if not any(chunk.path == name or chunk.path.startswith(f"{name}.") for name in columns):
+                continue
+            path, values, width = chunk.path, 0, _TYPE_BYTES.get(chunk.kind, 8)
+            if chunk.start < 4 or not 0 <= chunk.packed <= MAX_FILE_BYTES:
+                raise FormatError(file, path, f"{chunk.packed} bytes at {chunk.start}", "a column inside the file")
+            stream.seek(chunk.start)
+            data = _Thrift(stream.read(chunk.packed))
+            while data.at < len(data.bytes) and values < chunk.values:
+                try:
+                    page = data.struct()
+                    full, packed = int(page[2]), int(page[3])
+                    inner = page.get(5) or page.get(8) or {}
+                    count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
+                except _DAMAGE as error:
+                    raise FormatError(file, path, f"a page header: {error}", "a whole page") from None
+                if min(full, packed, count) < 0 or packed > len(data.bytes) - data.at or full > chunk.unpacked:
+                    problem = f"a page of {packed} bytes that unpack into {full}"
+                    raise FormatError(file, path, problem, f"at most {chunk.unpacked}")
+                values += count
+                if entries and chunk.kind.endswith("BYTE_ARRAY"):
+                    content = data.bytes[data.at : data.at + packed]
+                    width = max(width, _longest_dictionary_entry(file, chunk, content, full))
+                total += max(full, width * max(count, entries))
+                data.at += packed
+            if values != chunk.values:
+                raise FormatError(file, path, f"pages of {values} values", chunk.values)
             if total > limit:
-                raise FormatError(file, chunk.path, f"{total} bytes", f"at most {limit}")
+                raise FormatError(file, path, f"{total} bytes", f"at most {limit}")
 
 
 def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
@@ -228,45 +252,15 @@ def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
         for number, group in enumerate(_Thrift(footer).iter_structs(4)):
             for fields in (column[3] for column in group[1]) if number in groups else ():
                 start, dictionary = int(fields[9]), int(fields.get(11) or 0)
-                kind, codec, values, unpacked, packed = (int(fields[k]) for k in (1, 4, 5, 6, 7))
+                kind, codec, *sizes = (int(fields[k]) for k in (1, 4, 5, 6, 7))
                 path = b".".join(fields[3]).decode("utf-8", "replace")
                 if min(kind, codec) < 0:
                     raise ValueError(f"type {kind} and codec {codec} of {path}")
                 start = dictionary if 0 < dictionary < start else start
-                names = _PHYSICAL_TYPES[kind], _CODECS[codec]
-                chunks.append(_Chunk(path, *names, values, unpacked, packed, start))
+                chunks.append(_Chunk(path, _PHYSICAL_TYPES[kind], _CODECS[codec], *sizes, start))
     except _DAMAGE as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
     return chunks
-
-
-def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
-    """Unpacked bytes of the pages of one column chunk."""
-    values = unpacked = 0
-    width = _TYPE_BYTES.get(chunk.kind, 8)
-    if chunk.start < 4 or not 0 <= chunk.packed <= MAX_FILE_BYTES:
-        raise FormatError(file, chunk.path, f"{chunk.packed} bytes at {chunk.start}", "a column inside the file")
-    stream.seek(chunk.start)
-    data = _Thrift(stream.read(chunk.packed))
-    while data.at < len(data.bytes) and values < chunk.values:
-        try:
-            page = data.struct()
-            full, packed = int(page[2]), int(page[3])
-            inner = page.get(5) or page.get(8) or {}
-            count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
-        except _DAMAGE as error:
-            raise FormatError(file, chunk.path, f"a page header: {error}", "a whole page") from None
-        if min(full, packed, count) < 0 or packed > len(data.bytes) - data.at or full > chunk.unpacked:
-            problem = f"a page of {packed} bytes that unpack into {full}"
-            raise FormatError(file, chunk.path, problem, f"at most {chunk.unpacked}")
-        values += count
-        if entries and chunk.kind.endswith("BYTE_ARRAY"):
-            width = max(width, _longest_dictionary_entry(file, chunk, data.bytes[data.at : data.at + packed], full))
-        unpacked += max(full, width * max(count, entries))
-        data.at += packed
-    if values != chunk.values:
-        raise FormatError(file, chunk.path, f"pages of {values} values", chunk.values)
-    return unpacked
 
 
 def _longest_dictionary_entry(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:

@@ -108,31 +108,23 @@ def to_opencv_distortion(info: Any, file: Path) -> list[float] | None:
         return None
     model = info.distortion_model.strip().lower().replace(" ", "_")
     if model == "inverse_brown_conrady":
-        return _invert_brown_conrady(D, info, file)
+        # Coefficients of the lens whose *inverse* has the stated ones, by least squares over the image
+        if len(D) < 5:
+            raise FormatError(file, "D", f"{len(D)} numbers", "5: k1 k2 p1 p2 k3")
+        u, v = np.meshgrid(np.linspace(0, info.width - 1, _GRID), np.linspace(0, info.height - 1, _GRID))
+        x, y = (u - info.k[2]) / info.k[0], (v - info.k[5]) / info.k[4]
+        distorted = np.stack((x, y), -1).reshape(-1, 2)
+        ideal = distorted + np.tensordot(_brown_conrady_terms(distorted), np.array(D[:5]), 1)
+        terms, target = _brown_conrady_terms(ideal).reshape(-1, 5), (distorted - ideal).reshape(-1)
+        coefficients = np.linalg.lstsq(terms, target, rcond=None)[0]
+        error = np.abs(terms @ coefficients - target).max() * info.k[0]
+        if not error <= _MAX_INVERSION_PX:
+            raise FormatError(file, "D", f"a lens inverted to {error:.2g} px", f"at most {_MAX_INVERSION_PX} px")
+        return [float(c) for c in coefficients]
     if model not in _OPENCV_MODELS or len(D) < 4:
         expected = f"{', '.join(_OPENCV_MODELS)}, or pictures rectified beforehand"
         raise FormatError(file, "distortion_model", f"{info.distortion_model} of {len(D)} numbers", expected)
     return D[: 8 if len(D) >= 8 else min(len(D), 5)]
-
-
-def _invert_brown_conrady(D: list[float], info: Any, file: Path) -> list[float]:
-    """Coefficients of the lens whose *inverse* has the stated ones, by least squares over the image.
-
-    The stated model maps distorted to ideal coordinates; with the pairs known, the wanted one is linear in its
-    coefficients.
-    """
-    if len(D) < 5:
-        raise FormatError(file, "D", f"{len(D)} numbers", "5: k1 k2 p1 p2 k3")
-    u, v = np.meshgrid(np.linspace(0, info.width - 1, _GRID), np.linspace(0, info.height - 1, _GRID))
-    x, y = (u - info.k[2]) / info.k[0], (v - info.k[5]) / info.k[4]
-    distorted = np.stack((x, y), -1).reshape(-1, 2)
-    ideal = distorted + np.tensordot(_brown_conrady_terms(distorted), np.array(D[:5]), 1)
-    terms, target = _brown_conrady_terms(ideal).reshape(-1, 5), (distorted - ideal).reshape(-1)
-    coefficients = np.linalg.lstsq(terms, target, rcond=None)[0]
-    error = np.abs(terms @ coefficients - target).max() * info.k[0]
-    if not error <= _MAX_INVERSION_PX:
-        raise FormatError(file, "D", f"a lens inverted to {error:.2g} px", f"at most {_MAX_INVERSION_PX} px")
-    return [float(c) for c in coefficients]
 
 
 def _brown_conrady_terms(xy: np.ndarray) -> np.ndarray:

@@ -269,11 +269,6 @@ def _iter_boxes(stream: BinaryIO, at: int, stop: int, depth: int) -> Iterator[tu
         at = end
 
 
-def _index_entries(stream: Any) -> Any:
-    """The index entries of a stream (PyAV ≥ 17), else empty: then packets are read instead, more slowly."""
-    return getattr(stream, "index_entries", ())
-
-
 class _Decoder:
     """One open video, its table of frames and its current position."""
 
@@ -288,31 +283,28 @@ class _Decoder:
         self.one_thread = {"threads": 1} if int(import_optional("av").__version__.partition(".")[0]) >= 17 else {}
         self.container, self.display, self.errors = _open_container(file, all_frames=all_frames, track=track)
         try:
-            self.header = self._start()
+            streams = self.container.streams.video
+            if len(streams) <= self.track:
+                raise FormatError(self.file, "streams", f"{len(streams)} of video", f"at least {self.track + 1}")
+            self.stream = streams[self.track]
+            context = self.stream.codec_context
+            if context is None:
+                raise FormatError(self.file, "codec", "an unknown one", "a codec with a decoder")
+            context.thread_count = 1  # a data loader has its own workers
+            h, w = context.height, context.width
+            if not 0 < h * w <= _MAX_VIDEO_PIXELS:
+                raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {_MAX_VIDEO_PIXELS} pixels")
+            index = getattr(self.stream, "index_entries", ())
+            visible = [entry for entry in index if not entry.is_discard]
+            n = len(visible) if len(index) >= self.stream.frames > 0 else len(self.table())
+            if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
+                raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
+            rate = self.stream.average_rate
+            pixels = context.pix_fmt or "unknown"
+            self.header = VideoHeader((h, w), n, float(rate) if rate else None, context.name, pixels, self.display)
         except self.errors as error:
             self.container.close()
             raise error if isinstance(error, FormatError) else FormatError(file, "header", error, "a video") from None
-
-    def _start(self) -> VideoHeader:
-        streams = self.container.streams.video
-        if len(streams) <= self.track:
-            raise FormatError(self.file, "streams", f"{len(streams)} of video", f"at least {self.track + 1}")
-        self.stream = streams[self.track]
-        context = self.stream.codec_context
-        if context is None:
-            raise FormatError(self.file, "codec", "an unknown one", "a codec with a decoder")
-        context.thread_count = 1  # a data loader has its own workers
-        h, w = context.height, context.width
-        if not 0 < h * w <= _MAX_VIDEO_PIXELS:
-            raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {_MAX_VIDEO_PIXELS} pixels")
-        index = _index_entries(self.stream)
-        visible = [entry for entry in index if not entry.is_discard]
-        n = len(visible) if len(index) >= self.stream.frames > 0 else len(self.table())
-        if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
-            raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
-        rate = self.stream.average_rate
-        pixels = context.pix_fmt or "unknown"
-        return VideoHeader((h, w), n, float(rate) if rate else None, context.name, pixels, self.display)
 
     def table(self) -> np.ndarray:
         """(n,) int64 presentation stamps in time-base units, increasing; fills ``keys`` on the way."""

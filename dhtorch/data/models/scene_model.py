@@ -99,20 +99,16 @@ class SceneModel:
             camera = view.camera
             uv = cam.project(cam.ideal(camera), torch.where(z[:, None] > 0, local, 1.0)[None])
             uv = cam.distort(camera, uv)[0]
-            keep = _unoccluded(uv, z, view.hw)
+            # Points (N,) inside a picture that are not behind others in their cell
+            inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] <= view.hw[1] - 1) & (uv[:, 1] <= view.hw[0] - 1)
+            cell = (uv.nan_to_num(-1.0) / (max(view.hw) / _OCCLUSION_CELLS)).long()
+            key = torch.where(inside, cell[:, 1] * (_OCCLUSION_CELLS + 1) + cell[:, 0], 0).clamp_min(0)
+            nearest = torch.full((int(key.max()) + 1 if len(key) else 1,), torch.inf, dtype=z.dtype)
+            nearest.scatter_reduce_(0, key[inside], z[inside], "amin")
+            keep = inside & (z <= (1 + _OCCLUSION_REL) * nearest[key])
         else:
             uv, keep = torch.from_numpy(np.array(view.uv)), z > 0
         return uv[keep].double(), z[keep].double()
-
-
-def _unoccluded(uv: Tensor, z: Tensor, hw: tuple[int, int]) -> Tensor:
-    """Points (N,) inside a picture that are not behind others in their cell."""
-    inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] <= hw[1] - 1) & (uv[:, 1] <= hw[0] - 1)
-    cell = (uv.nan_to_num(-1.0) / (max(hw) / _OCCLUSION_CELLS)).long()
-    key = torch.where(inside, cell[:, 1] * (_OCCLUSION_CELLS + 1) + cell[:, 0], 0).clamp_min(0)
-    nearest = torch.full((int(key.max()) + 1 if len(key) else 1,), torch.inf, dtype=z.dtype)
-    nearest.scatter_reduce_(0, key[inside], z[inside], "amin")
-    return inside & (z <= (1 + _OCCLUSION_REL) * nearest[key])
 
 
 def write_model(model: SceneModel, out: Path, similarity: Similarity) -> None:

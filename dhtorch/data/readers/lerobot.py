@@ -24,7 +24,7 @@ from dhtorch.codes import Source
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.clocks import nearest_stamps
-from dhtorch.data.codecs.parquet import read_cell
+from dhtorch.data.codecs.parquet import read_row
 from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.data.io import decode as files
 from dhtorch.data.readers.lerobot_meta import (
@@ -239,7 +239,7 @@ class _Load:
 
     def _numbers(self, i: int, feature: LeRobotFeature) -> np.ndarray:
         """Numbers (h, w) of a row, stored as an array."""
-        values = np.asarray(read_cell(self.data, feature.key, int(self.rows[i])))
+        values = np.asarray(read_row(self.data, (feature.key,), int(self.rows[i]))[feature.key])
         files.refuse_if(
             values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu",
             self.data,

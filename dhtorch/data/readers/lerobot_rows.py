@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dhtorch.data.clocks import format_numbers, nearest_stamps
-from dhtorch.data.codecs.parquet import read_cell, read_columns
+from dhtorch.data.codecs.parquet import read_columns, read_row
 from dhtorch.data.codecs.tiff import decode_tiff, decode_tiff_header
 from dhtorch.data.codecs.video import read_video_header, read_video_times
 from dhtorch.data.depth_codes import CODE_BITS, DEFAULT_RANGE, N_CODES, find_return_range, metres_by_code
@@ -139,7 +139,7 @@ def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[byt
     Raises:
         FormatError: no image in that cell, or a missing file.
     """
-    cell = read_cell(table, key, row)
+    cell = read_row(table, (key,), row)[key]
     files.refuse_if(not isinstance(cell, dict), table, key, type(cell).__name__, "an image: bytes and path")
     data, path = cell.get("bytes"), cell.get("path")
     if isinstance(data, bytes) and data:
