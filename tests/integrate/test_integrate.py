@@ -9,7 +9,7 @@ import torch
 from support.box_scene import BOX, HW, off_wall, walk
 from support.room_truth import room_distance
 
-from dhtorch import MAP, extend
+from dhtorch import extend
 from dhtorch.codes import Gate, Source
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
@@ -27,7 +27,6 @@ from dhtorch.integrate import (
     sweeps,
 )
 from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
-from dhtorch.stages.holes import classify
 from dhtorch.synthetic.recording import SyntheticRoom
 
 VOXEL = 0.05
@@ -60,55 +59,43 @@ def box():
 # ------------------------------------------------------------------------------------------------------------ surfaces
 
 
-def test_points_and_mesh_lie_on_the_walls_of_the_box(box):
+def test_points_and_mesh_lie_on_the_walls_face_the_open_side_and_have_no_seams(box):
     pytest.importorskip("skimage")
-    for surface in (extract_points(box), extract_mesh(box)):
+    for surface in (extract_points(box), meshed := extract_mesh(box)):
         off = off_wall(surface.xyz) * BOX.min()
         assert len(surface.xyz) > 3000 and float(off.median()) < 0.001 and float(off.quantile(0.99)) < VOXEL / 4
         inward = (surface.normal.double() * -surface.xyz.double().sign()).amax(-1)
         assert float((inward > 0.98).double().mean()) > 0.95, "normals face the open side"
-
-
-def test_a_mesh_faces_the_open_side_and_has_no_seams(box):
-    pytest.importorskip("skimage")
-    surface = extract_mesh(box)
-    a, b, c = surface.xyz.double()[surface.face].unbind(1)
-    area = torch.linalg.cross(b - a, c - a)
-    towards = (area * -a).sum(-1)
+    a, b, c = meshed.xyz.double()[meshed.face].unbind(1)
+    towards = (torch.linalg.cross(b - a, c - a) * -a).sum(-1)
     assert float((towards > 0).double().mean()) > 0.995
-    edges = torch.cat([surface.face[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]).sort(1).values
+    edges = torch.cat([meshed.face[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]).sort(1).values
     uses = edges.unique(dim=0, return_counts=True)[1]
     assert int(uses.max()) == 2, "no edge between more than two triangles"
-    block = (surface.xyz / (VOXEL * 64)).floor().long()
-    assert len(block.unique(dim=0)) > 1, "more than one brick"
+    assert len((meshed.xyz / (VOXEL * 64)).floor().long().unique(dim=0)) > 1, "more than one brick"
     trimesh = pytest.importorskip("trimesh")
-    whole = trimesh.Trimesh(surface.xyz.numpy(), surface.face.numpy(), process=False)
-    main = max(whole.split(only_watertight=False), key=lambda part: len(part.faces))
-    assert len(main.faces) > 0.95 * len(surface.face), "bricks are joined"
-
-
-def seen_from_four_places(hw, voxel):
-    """Exact depth of the built-in room: recording, volume, all that was seen."""
-    source = SyntheticRoom(lidar="exact", hw=hw, supersample=1)
-    volume, seen = make_volume(voxel, channels=3), []
-    for i in (0, 3, 6, 9):
-        one = view(source[i], T=source.true_poses[i : i + 1])
-        volume = fuse_views(volume, one)
-        v, u = torch.meshgrid(torch.arange(hw[0]), torch.arange(hw[1]), indexing="ij")
-        uv = torch.stack((u, v), -1).view(1, -1, 2).float()
-        xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
-        seen.append(se3.apply(one.T_world_from_cam.to(torch.float32), xyz)[0])
-    return source, volume, torch.cat(seen)
+    parts = trimesh.Trimesh(meshed.xyz.numpy(), meshed.face.numpy(), process=False).split(only_watertight=False)
+    assert max(len(part.faces) for part in parts) > 0.95 * len(meshed.face), "bricks are joined"
 
 
 @pytest.fixture(scope="module")
 def room():
-    return seen_from_four_places((144, 192), 0.03)
+    """Exact depth of the built-in room from four places: volume, all that was seen."""
+    source = SyntheticRoom(lidar="exact", hw=(144, 192), supersample=1)
+    volume, seen = make_volume(0.03, channels=3), []
+    for i in (0, 3, 6, 9):
+        one = view(source[i], T=source.true_poses[i : i + 1])
+        volume = fuse_views(volume, one)
+        v, u = torch.meshgrid(torch.arange(144), torch.arange(192), indexing="ij")
+        uv = torch.stack((u, v), -1).view(1, -1, 2).float()
+        xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
+        seen.append(se3.apply(one.T_world_from_cam.to(torch.float32), xyz)[0])
+    return volume, torch.cat(seen)
 
 
 def test_the_furnished_room_is_found_exactly_and_completely_and_nothing_where_nothing_was_seen(room):
     pytest.importorskip("skimage")
-    _, volume, seen = room
+    volume, seen = room
     meshed, crossings = extract_mesh(volume), extract_points(volume)
     error = room_distance(meshed.xyz)
     assert float(error.median()) < 0.002 and float(error.mean()) < 0.006 and float(error.quantile(0.99)) < 0.05
@@ -457,33 +444,3 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
         torch.testing.assert_close(depth, torch.where(there, frame.depth, 0.0), rtol=1e-3, atol=0)
         assert torch.equal(score, 0.5 * there) and torch.equal(source, Source.SWEPT * there.float())
         assert float((sigma - 0.02 * there).abs().max()) < 1e-4
-
-
-@pytest.mark.slow
-def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():
-    room = SyntheticRoom(hw=(150, 200), n_frames=8, supersample=1, step_m=0.03)
-    calls = []
-    method = MAP.replace(n=512, classify=lambda *args: calls.append(1) or classify(*args))
-    answers = list(
-        recording.estimate_pairs(room, method, [(0, 5), (2, 7)], cutoff=2.0, sweep=sweeps.DenseSweep({"planes": 40}))
-    )
-    assert len(calls) == 2
-    places = recording.place_frames(room, answers)
-    sparse = recording.fuse_recording(
-        room, make_volume(0.04), [replace(a, swept=None) for a in answers], places, cutoff=2.0
-    )
-    dense = recording.fuse_recording(room, make_volume(0.04), answers, places, cutoff=2.0)
-    near = [(far_of(room, 0, extract_points(volume).xyz) < 0.08).double().mean() for volume in (sparse, dense)]
-    assert near[1] > 1.4 * near[0] > 0.2
-    surface = extract_points(dense)
-    off = room_distance(surface.xyz[surface.source == Source.SWEPT])
-    assert len(off) > 1000 and float(off.median()) < 0.04 and float((off > 0.2).double().mean()) < 0.1
-
-
-def far_of(room, k, xyz):
-    """Distance of what frame ``k`` truly shows beyond the cutoff from the nearest of some points."""
-    frame = room[k]
-    depth = room.truth(k)["depth"][0]
-    v, u = (depth > 2.2).nonzero()[::7].T
-    true = cameras.unproject(frame.camera, torch.stack((u, v), -1)[None].float(), depth[None, v, u].float())
-    return torch.cdist(se3.apply(frame.T_world_from_cam, true.double())[0], xyz.double()).amin(1)

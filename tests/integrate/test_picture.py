@@ -1,6 +1,6 @@
 """The drawing of a map: where it is seen from, how large it is drawn, and what each of its two pictures shows."""
 
-import math
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from dhtorch.codes import Source
-from dhtorch.geometry import se3
 from dhtorch.integrate import picture
 from dhtorch.integrate.surface import Surface
 from dhtorch.records import Pose
@@ -18,199 +17,119 @@ VOXEL_M = 0.05
 UP = (0.0, -1.0, 0.0)
 
 
-def wall(depth=3.0, half=1.0, source=Source.SENSOR, rgb=(0.25, 0.5, 0.75)):
-    """A square wall in front of the origin that faces it, a point every 5 cm."""
-    steps = torch.arange(-half, half + 1e-6, VOXEL_M)
+def wall(x0=0.0, source=Source.SENSOR, rgb=(0.25, 0.5, 0.75), facing=-1.0):
+    """A square wall 3 m in front of the origin that faces it, a point every 5 cm."""
+    steps = torch.arange(-1, 1 + 1e-6, VOXEL_M)
     x, y = torch.meshgrid(steps, steps, indexing="xy")
-    xyz = torch.stack((x.flatten(), y.flatten(), torch.full((x.numel(),), depth)), 1)
+    xyz = torch.stack((x0 + x.flatten(), y.flatten(), torch.full((x.numel(),), 3.0)), 1)
     n = len(xyz)
     features = torch.tensor([*rgb, 0.5]).expand(n, 4)
-    normal = torch.tensor([0.0, 0.0, -1.0]).expand(n, 3)
+    normal = torch.tensor([0.0, 0.0, facing]).expand(n, 3)
     return Surface(xyz, normal, features, torch.full((n,), 0.01), torch.full((n,), source, dtype=torch.int32))
 
 
-def joined(*surfaces):
-    """One surface of all points."""
-    parts = [[getattr(s, name) for s in surfaces] for name in ("xyz", "normal", "features", "sigma", "source")]
-    return Surface(*(torch.cat(each) for each in parts))
+def camera_at(*place, R=torch.eye(3)):  # noqa: B008  (looks along z)
+    return Pose(R[None], torch.tensor([place]))
 
 
-def cameras_at(*places):
-    """Cameras that look along z, by their places in the world."""
-    return [Pose(torch.eye(3)[None], torch.tensor([place])) for place in places]
+DOWN = torch.tensor([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # z of the camera = +y
+BACK = torch.diag(torch.tensor([-1.0, 1, -1]))
 
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Draws a map and returns what is handed to the canvas."""
+    """Draws a map: the axes of both pictures, their titles and pixels, and the words of the legend."""
+    figures = []
+    monkeypatch.setattr(picture, "save_figure", lambda figure, path: figures.append(figure))
 
     def call(surface, cameras, **options):
-        kept = SimpleNamespace()
-
-        def keep(path, pictures, camera_path, counts, metre):
-            kept.pictures, kept.camera_path, kept.counts, kept.metre = pictures, camera_path, counts, metre
-
-        monkeypatch.setattr(picture, "_side_by_side", keep)
         picture.draw_map("a.png", surface, cameras, UP, voxel=VOXEL_M, **options)
-        return kept
+        axes, legends = figures[-1].axes, figures[-1].legends
+        words = [text.get_text() for legend in legends for text in legend.get_texts()]
+        images = [each.images[0].get_array() for each in axes]
+        return SimpleNamespace(
+            axes=axes, titles=[each.get_title("left") for each in axes], images=images, words=words, legends=legends
+        )
 
     return call
 
 
-# ---------------------------------------------------------------------------------------------------------- view point
+@pytest.mark.parametrize(
+    ("cameras", "direction", "hw"),
+    [
+        # ahead = z, above = -y, beside = ahead x above = x: from behind, above and beside the cameras
+        ([camera_at(0.0, 0.0, 0.0), camera_at(0.2, 0.0, 0.0)], (-0.25, 0.45, 1.0), (150, 200)),
+        ([camera_at(-0.5, 0.0, 1.0), camera_at(0.0, 0.0, 1.0), camera_at(0.5, 0.0, 1.0)], (-0.25, 0.45, 1.0), (100, 300)),
+        ([camera_at(0.0, 0.0, 0.0, R=DOWN)], (1.0, 0.45, 0.25), (150, 200)),
+        ([camera_at(0.0, 0.0, 0.0), camera_at(0.0, 0.0, 0.0, R=BACK)], (-0.25, 0.45, 1.0), (150, 200)),
+    ],
+)  # fmt: skip
+def test_a_wall_fills_nine_tenths_of_the_narrower_side_seen_from_behind_and_above(drawn, cameras, direction, hw):
+    surface, size = wall(), np.array(hw[::-1])
+    z = np.array(direction) / np.linalg.norm(direction)
+    x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))  # level, so that up is up in the picture
+    R, xyz = np.stack((x, np.cross(z, x), z)), surface.xyz.double().numpy()
+    middle = np.median(xyz, 0)
+    eye = middle - 2.2 * np.quantile(np.linalg.norm(xyz - middle, axis=1), 0.9) * z
+    points, path = ((each - eye) @ R.T for each in (xyz, np.concatenate([c.t for c in cameras])))
+    path = path[path[:, 2] > VOXEL_M]
+    flat = np.concatenate((points, path))[:, :2] / np.concatenate((points, path))[:, 2:]
+    low, high = np.quantile(flat, (0.005, 0.995), axis=0)
+    focal = (0.9 * size / (high - low)).min()
+    at = focal * flat + size / 2 - focal * (low + high) / 2
+    found = drawn(surface, cameras, hw=hw)
+    inside = ((at >= -0.5) & (at <= size - 0.5)).all(1)
+    for axes in found.axes:
+        dots, bar = (line.get_xydata() for line in axes.lines)
+        np.testing.assert_allclose(dots, at[len(xyz) :][inside[len(xyz) :]], atol=1e-6)
+        metres = float(axes.texts[0].get_text().removesuffix(" m"))
+        assert np.ptp(bar, 0) == pytest.approx([metres * focal / np.median(points[:, 2]), 0])
+    column, row = np.rint(at[: len(xyz)][inside[: len(xyz)]]).astype(int).clip(0, size - 1).T
+    assert (found.images[0][row, column] == (0.25, 0.5, 0.75)).all() and (found.images[0] == 1).all(-1).any()
 
 
-def test_the_view_point_is_behind_above_and_beside_the_cameras():
-    surface, cameras = wall(), cameras_at((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
-    T = picture._viewpoint(surface, cameras, UP)
-    R, t = T.R[0], T.t[0]
-    torch.testing.assert_close(R.T @ R, torch.eye(3).double())
-    assert float(torch.linalg.det(R)) == pytest.approx(1)
-    # ahead = z, above = -y, beside = ahead x above = x
-    wanted = np.array([-0.25, 0.45, 1.0]) / math.sqrt(0.25**2 + 0.45**2 + 1)
-    np.testing.assert_allclose(R[:, 2], wanted, atol=1e-12)
-    assert float(R[1, 0]) == pytest.approx(0, abs=1e-12), "the horizon is level"
-    assert float(R[1, 1]) > 0, "up in the world is up in the picture"
-    xyz = surface.xyz.double()
-    middle = xyz.median(0).values
-    far = np.quantile((xyz - middle).norm(dim=-1).numpy(), 0.9)
-    np.testing.assert_allclose(t, middle.numpy() - 2.2 * far * wanted, atol=1e-6)
-
-
-def test_cameras_that_look_down_or_at_one_another_still_have_a_level_direction():
-    down = Pose(torch.tensor([[[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]]), torch.zeros(1, 3))  # z of the camera = +y
-    T = picture._viewpoint(wall(), [down], UP)
-    np.testing.assert_allclose(T.R[0, :, 2] * math.sqrt(1 + 0.25**2 + 0.45**2), [1, 0.45, 0.25], atol=1e-12)
-    opposite = [*cameras_at((0.0, 0.0, 0.0)), Pose(torch.diag(torch.tensor([-1.0, 1, -1]))[None], torch.zeros(1, 3))]
-    T = picture._viewpoint(wall(), opposite, UP)
-    np.testing.assert_allclose(T.R[0, :, 2] * math.sqrt(1 + 0.25**2 + 0.45**2), [-0.25, 0.45, 1], atol=1e-12)
-
-
-# -------------------------------------------------------------------------------------------------------------- camera
-
-
-@pytest.mark.parametrize("hw", [(600, 800), (300, 900)])
-def test_the_points_fill_nine_tenths_of_the_narrower_side(hw):
-    draw = np.random.default_rng(0)
-    flat = draw.uniform((-0.4, -0.1), (0.8, 0.5), (4000, 2))
-    z = draw.uniform(1, 5, (4000, 1))
-    camera = picture._fit_camera(torch.from_numpy(np.hstack((flat * z, z))), hw)
-    low, high = np.quantile(flat, 0.005, 0), np.quantile(flat, 0.995, 0)
-    focal = min(0.9 * hw[1] / (high - low)[0], 0.9 * hw[0] / (high - low)[1])
-    np.testing.assert_allclose(camera.f, [[focal, focal]], rtol=1e-9)
-    np.testing.assert_allclose(camera.c, [np.array([hw[1], hw[0]]) / 2 - focal * (low + high) / 2], rtol=1e-9)
-    for k, size in enumerate((hw[1], hw[0])):
-        ends = focal * np.array([low[k], high[k]]) + float(camera.c[0, k])
-        assert ends.mean() == pytest.approx(size / 2), "in the middle"
-
-
-# ------------------------------------------------------------------------------------------------------------ pictures
-
-
-def test_both_pictures_show_the_wall_in_its_colours_and_in_those_of_its_sources(drawn):
-    left = wall(source=Source.SENSOR, rgb=(0.25, 0.5, 0.75))
-    right = wall(source=Source.RECOVERED, rgb=(0.75, 0.25, 0.5))
-    right = right.replace(xyz=right.xyz + torch.tensor([2.1, 0.0, 0.0]))
-    cameras = cameras_at((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
-    kept = drawn(joined(left, right), cameras, title="a scene", hw=(150, 200))
-    assert list(kept.pictures) == ["a scene: map of 2 views", "Sensor and recovered"]
-    own, by_source = kept.pictures.values()
-    assert own.shape == by_source.shape == (150, 200, 3)
-    shown = ~(own == 1).all(-1)
+def test_both_pictures_show_the_walls_in_their_colours_and_in_those_of_their_sources(drawn):
+    """Walls that face away are left out and counted."""
+    own = {Source.SENSOR: (0.25, 0.5, 0.75), Source.RECOVERED: (0.75, 0.25, 0.5), Source.SWEPT: (0.0, 1.0, 0.0)}
+    walls = [wall(2.1 * k, code, rgb, (-1.0, -1.0, 1.0)[k]) for k, (code, rgb) in enumerate(own.items())]
+    parts = [[getattr(s, name) for s in walls] for name in ("xyz", "normal", "features", "sigma", "source")]
+    surface = Surface(*(torch.cat(each) for each in parts))
+    found = drawn(surface, [camera_at(-0.5, 0.0, 0.0), camera_at(0.5, 0.0, 0.0)], title="a scene", hw=(150, 200))
+    assert found.titles == ["a scene: map of 2 views", "Sensor, recovered and swept"]
+    assert found.words == [f"{name} {len(walls[0].xyz)}" for name in ("sensor", "recovered", "recovered (swept)")]
+    colours = [SOURCE_COLOURS[code] for code in own]
+    assert [handle.get_color() for handle in found.legends[0].legend_handles] == colours
+    one, by_source = found.images
+    shown = ~(one == 1).all(-1)
     assert 0.2 < shown.mean() < 0.9 and ((by_source == 1).all(-1) == ~shown).all()
-    own_colours = {tuple(np.round(c, 6)) for c in own[shown]}
-    assert own_colours == {(0.25, 0.5, 0.75), (0.75, 0.25, 0.5)}
-    columns = [np.nonzero((np.abs(own - colour) < 1e-6).all(-1))[1].mean() for colour in sorted(own_colours)]
-    assert columns[0] < columns[1], "what is left is left"
-    for colour, code in zip(sorted(own_colours), (Source.SENSOR, Source.RECOVERED), strict=True):
-        pixel = by_source[(np.abs(own - colour) < 1e-6).all(-1)]
-        rgb = np.array([int(SOURCE_COLOURS[code][k : k + 2], 16) for k in (1, 3, 5)]) / 255
-        np.testing.assert_allclose(pixel, np.broadcast_to(rgb * shade_of_the_wall(), pixel.shape), atol=1e-6)
-    assert kept.counts == {Source.SENSOR: len(left.xyz), Source.RECOVERED: len(right.xyz)}
+    # seen along z, with x level: the walls' normal, lit from the upper left in the picture
+    z = np.array([-0.25, 0.45, 1.0]) / np.linalg.norm([-0.25, 0.45, 1.0])
+    x = np.array([z[2], 0, -z[0]]) / np.hypot(z[0], z[2])
+    shade = 0.35 + 0.65 * abs(-np.stack((x, np.cross(z, x), z))[:, 2] @ np.array([0.3, -0.5, -0.8]))
+    masks = [(np.abs(one - rgb) < 1e-6).all(-1) for rgb in own.values()]
+    assert sum(masks[:2]).sum() == shown.sum() and not masks[2].any()
+    assert np.nonzero(masks[0])[1].mean() < np.nonzero(masks[1])[1].mean(), "what is left is left"
+    for mask, colour in itertools.islice(zip(masks, colours, strict=True), 2):
+        rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+        np.testing.assert_allclose(by_source[mask], np.broadcast_to(rgb * shade, by_source[mask].shape), atol=1e-6)
 
 
-def shade_of_the_wall():
-    """Of a wall whose normal is -z in the world, lit from the upper left in the picture."""
-    T = picture._viewpoint(wall(), cameras_at((0.0, 0.0, 0.0)), UP)
-    normal = T.R[0].numpy().T @ np.array([0.0, 0, -1])
-    return 0.35 + 0.65 * min(abs(normal @ np.array([0.3, -0.5, -0.8])), 1)
-
-
-def test_walls_that_face_away_are_left_out_and_swept_points_are_counted_where_there_are_any(drawn):
-    behind = wall(source=Source.SWEPT)
-    facing = wall(depth=4.0)
-    away = behind.replace(normal=-behind.normal, features=torch.tensor([0.0, 1.0, 0.0, 1.0]).expand(len(behind.xyz), 4))
-    kept = drawn(joined(facing, away), cameras_at((0.0, 0.0, 0.0)), hw=(90, 120))
-    own = next(iter(kept.pictures.values()))
-    assert not (np.abs(own - [0, 1, 0]) < 1e-6).all(-1).any()
-    assert list(kept.pictures) == ["Map of 1 view", "Sensor, recovered and swept"]
-    assert kept.counts == {Source.SENSOR: len(facing.xyz), Source.RECOVERED: 0, Source.SWEPT: len(away.xyz)}
-
-
-def test_the_path_and_the_length_of_a_metre_are_those_of_the_drawing(drawn):
-    cameras, hw = cameras_at((-0.5, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5, 0.0, 1.0)), (150, 200)
-    surface = wall()
-    kept = drawn(surface, cameras, hw=hw)
-    T = picture._viewpoint(surface, cameras, UP)
-    xyz = se3.apply(se3.invert(T), surface.xyz[None].double())[0]
-    path = se3.apply(se3.invert(T), torch.cat([c.t for c in cameras])[None].double())[0]
-    camera = picture._fit_camera(torch.cat((xyz, path)), hw)
-    assert kept.metre == pytest.approx(float(camera.f[0, 0] / xyz[:, 2].median()))
-    wanted = camera.f * path[:, :2] / path[:, 2:] + camera.c
-    np.testing.assert_allclose(kept.camera_path, wanted, atol=1e-9)
-
-
-def test_a_map_without_points_is_white_and_has_no_scale(drawn):
-    none, (camera,) = wall().map(lambda x: x[:0]), cameras_at((1.0, 2.0, 3.0))
-    kept = drawn(none, [camera], hw=(30, 40))
-    assert kept.metre is None and all((each == 1).all() for each in kept.pictures.values())
-    T = picture._viewpoint(none, [camera], UP)
-    np.testing.assert_allclose(T.t[0], np.array([1, 2, 4.0]) - 2.2 * T.R[0, :, 2].numpy(), atol=1e-9)
-    ahead = picture._fit_camera(torch.zeros(0, 3), (600, 800))
-    assert ahead.f.tolist() == [[800, 800]] and ahead.c.tolist() == [[400, 300]]
-
-
-# -------------------------------------------------------------------------------------------------------------- figure
-
-
-@pytest.fixture
-def saved(monkeypatch):
-    """The figures that are saved."""
-    figures = []
-    monkeypatch.setattr(picture, "save_figure", lambda figure, path: figures.append(figure))
-    return figures
-
-
-def test_two_pictures_lie_side_by_side_with_path_scale_and_legend(saved):
-    pictures = {"one": np.zeros((150, 200, 3)), "two": np.ones((150, 200, 3))}
-    path = np.array([[0.0, 0.0], [99.5, 74.5], [500.0, 10.0], [10.0, -5.0]])
-    picture._side_by_side("a.png", pictures, path, {Source.SENSOR: 7, Source.SWEPT: 9, Source.FILLED: 3}, 20.0)
-    (figure,) = saved
-    lefts = [72 * figure.get_figwidth() * axes.get_position().x0 for axes in figure.axes]
-    assert lefts == pytest.approx([0, 356]) and 72 * figure.get_figwidth() == pytest.approx(702)
-    for axes, (title, pixels) in zip(figure.axes, pictures.items(), strict=True):
-        assert axes.get_title("left") == title and (axes.images[0].get_array() == pixels).all()
-        cameras, bar = axes.lines
-        assert cameras.get_xydata().tolist() == path[:2].tolist(), "those inside"
-        ends = bar.get_xydata()
-        assert ends[1, 0] - ends[0, 0] == 2 * 20.0 and ends[0, 1] == ends[1, 1] and axes.texts[0].get_text() == "2 m"
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["sensor 7", "recovered (swept) 9", "filled 3"]
-    assert [h.get_color() for h in legend.legend_handles] == [
-        SOURCE_COLOURS[code] for code in (Source.SENSOR, Source.SWEPT, Source.FILLED)
-    ]
-
-
-def test_without_a_scale_or_a_path_neither_is_drawn(saved):
-    picture._side_by_side("a.png", {"one": np.zeros((20, 40, 3))}, np.zeros((0, 2)), {}, None)
-    (axes,) = saved[0].axes
-    assert not len(axes.lines[0].get_xydata()) and len(axes.lines) == 1 and not axes.texts and not saved[0].legends
+def test_a_map_of_which_nothing_is_seen_is_white_and_has_no_scale(drawn):
+    nothing = wall().map(lambda x: x[:0])
+    for surface, place, path in ((nothing, (1.0, 2.0, 3.0), [[20, 15]]), (wall(facing=1.0), (0.0, 0.0, -50.0), [])):
+        found = drawn(surface, [camera_at(*place)], hw=(30, 40))
+        assert found.titles == ["Map of 1 view", "Sensor and recovered"]
+        assert found.words == [f"sensor {len(surface.xyz)}", "recovered 0"]
+        assert all((each == 1).all() for each in found.images) and not any(axes.texts for axes in found.axes)
+        np.testing.assert_allclose(found.axes[0].lines[0].get_xydata(), np.reshape(path, (-1, 2)), atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("metre", "label"),
     [(69.3, "0.5 m"), (69.2, "1 m"), (34.6, "2 m"), (1e6, "0.001 m"), (0.0173, "2000 m"), (1e-9, "5000 m")],
 )
-def test_the_bar_is_the_longest_round_length_within_a_fifth(saved, metre, label):
+def test_the_bar_is_the_longest_round_length_within_a_fifth(monkeypatch, metre, label):
+    saved = []
+    monkeypatch.setattr(picture, "save_figure", lambda figure, path: saved.append(figure))
     picture._side_by_side("a.png", {"one": np.zeros((100, 346, 3))}, np.zeros((0, 2)), {}, metre)
     assert saved[0].axes[0].texts[0].get_text() == label
