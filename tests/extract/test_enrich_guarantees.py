@@ -26,7 +26,6 @@ from pyarrow import parquet
 from support import writers
 from support.dataset_folders import decode_map, read_files, read_rows
 
-from dhtorch import data
 from dhtorch.cli import capture_checks
 from dhtorch.cli.run import main
 from dhtorch.data.io.decode import FormatError
@@ -247,26 +246,6 @@ def test_the_past_alone_counts_and_of_the_same_episode(robot, whole, tmp_path):
     assert recovered[1] > 0 and recovered[0] == 0, "the source's poses are used"
 
 
-def test_an_older_version_of_the_format(robot, whole, tmp_path):
-    one = tmp_path / "older"
-    one.mkdir()
-    writers.write_lerobot(one / "set", [shots(n, 3 * k) for k, n in enumerate(LENGTHS)], depth="tiff", version=2)
-    out = enrich(one / "set", tmp_path / "out", "format=same")
-    about = json.loads((out / "meta" / "info.json").read_text())
-    assert about["codebase_version"] == "v2.1" and about["total_videos"] == len(LENGTHS)
-    lines = [json.loads(line) for line in (out / "meta" / "episodes_stats.jsonl").read_text().splitlines()]
-    assert [line["episode_index"] for line in lines] == [0, 1]
-    depth = lines[1]["stats"][f"{FRONT}_depth_enriched"]
-    for name, entry in lines[1]["stats"].items():  # what LeRobot 0.3 asks of them
-        wanted = (3, 1, 1) if "image" in name else np.shape(entry["min"])
-        assert {np.shape(v) for k, v in entry.items() if k != "count"} == {wanted}, name
-    assert depth["mean"][0] == depth["mean"][1] == depth["mean"][2]
-    again = data.open_all(out, depth=f"{FRONT}_depth_enriched")
-    assert [len(each) for each in again] == list(LENGTHS)
-    for a, b in zip(read_rows(out), read_rows(whole), strict=True):
-        assert a[f"{FRONT}_depth_enriched"] == b[f"{FRONT}_depth_enriched"]
-
-
 @pytest.mark.slow
 def test_the_whole_is_never_held(tmp_path, monkeypatch):
     content = os.urandom(300_000)
@@ -292,35 +271,6 @@ def test_the_whole_is_never_held(tmp_path, monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------------------- other sources
-
-
-def test_steps_of_robots_keep_what_they_say(tmp_path):
-    """RLDS: numbers, texts, splits, and pictures as they are encoded."""
-    source = tmp_path / "1.0.0"
-    writers.write_rlds(source, [shots(3), shots(2, 3)], split="train")
-    writers.write_rlds(source, [shots(2, 5)], split="val")
-    before = read_files(source)
-    out = enrich(source, tmp_path / "out", "data=rlds")
-    assert read_files(source) == before
-    found = read_rows(out)
-    assert [row["episode_index"] for row in found] == [0, 0, 0, 1, 1, 2, 2]
-    assert [row["index"] for row in found] == list(range(7)) and [row["frame_index"] for row in found][:3] == [0, 1, 2]
-    assert [row["action"] for row in found[:3]] == np.arange(21.0).reshape(3, 7).tolist()
-    assert [row["is_last"] for row in found] == [False, False, True, False, True, False, True]
-    about = json.loads((out / "meta" / "info.json").read_text())
-    assert about["splits"] == {"train": "0:2", "val": "2:3"} and about["features"]["is_last"]["dtype"] == "bool"
-    picture = np.array(Image.open(io.BytesIO(found[0]["observation.images.image_0"]["bytes"])))
-    assert np.array_equal(picture, shots(1)[0].image[0].permute(1, 2, 0).numpy())
-    inside = (source / "tiny_robot-train.tfrecord-00000-of-00001").read_bytes()
-    assert found[0]["observation.images.image_0"]["bytes"] in inside, "not encoded again"
-    said = [json.loads(line) for line in (out / "meta" / "source_episodes.jsonl").read_text().splitlines()]
-    assert [(row["split"], row["number"], row["episode_id"]) for row in said] == [
-        ("train", 0, -1),
-        ("train", 1, -1),
-        ("val", 0, -1),
-    ]
-    again = data.open_all(out, depth="observation.images.image_0_depth")
-    assert [len(each) for each in again] == [3, 2, 2]
 
 
 def test_counts_of_an_episode_are_sums_and_shares_along_it():

@@ -14,7 +14,6 @@ import torch
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
-import pyarrow
 from pyarrow import parquet
 from support import writers
 from support.processes import start, stop
@@ -134,29 +133,6 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     assert sum(int(row["dhtorch.pose_ok"]) for row in features) == 6
 
 
-def test_rows_join_the_data_set_by_episode_and_frame(robot, command):
-    assert command(*asked(robot, "data.episode=[2,0]", gap=0))[0] == 0
-    ours = pyarrow.concat_tables(parquet.read_table(p) for p in files("features"))
-    place = ["episode_index", "frame_index", "timestamp"]
-    theirs = parquet.read_table(next(robot.glob("data/*/*.parquet")), columns=place)
-    order = list(zip(ours["episode_index"].to_pylist(), ours["frame_index"].to_pylist(), strict=True))
-    assert order == [(e, f) for e in (0, 2) for f in range(LENGTHS[e])], "episodes keep their numbers"
-    pairs = ours.select(place).join(theirs, place[:2], right_suffix="_theirs", join_type="inner")
-    assert pairs.num_rows == LENGTHS[0] + LENGTHS[2]
-    assert np.allclose(pairs["timestamp"], pairs["timestamp_theirs"], atol=1e-6)
-    assert set(ours["recording"].to_pylist()) == {f"set/episode_{e:06d}/front" for e in (0, 2)}
-    with pytest.raises(KeyError, match="frame 0 of episode 1"):
-        FeatureTable("features", ["tokens"]).at(1, 0)
-
-
-@pytest.mark.slow
-def test_workers_make_the_same_files(robot, command):
-    assert command(*asked(robot))[0] == 0
-    code, _, err = command(*asked(robot, "workers=2", out="other"))
-    assert code == 0 and err == "", err
-    assert contents("features") == contents("other") and len(files("other")) == 3
-
-
 @pytest.fixture
 def many(tmp_path, shots):
     """Numbered frames on the disk, each a shard."""
@@ -201,24 +177,6 @@ def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path, many):
 def without_notes(err):
     """The lines of stderr beside the note on the unit that numbered frames do not state."""
     return [line for line in err.splitlines() if line != "set: depth unit assumed: 1/1000 m (data.depth_unit= sets it)"]
-
-
-@pytest.fixture
-def damaged(tmp_path, shots):
-    """Numbered frames, the fourth with half an image."""
-    writers.write_counted_frames(tmp_path / "set", shots[:8])
-    image = tmp_path / "set" / "images" / "00003.png"
-    image.write_bytes(image.read_bytes()[:500])
-    place = ["data=auto", f"data.root={tmp_path / 'set'}", "out=features"]
-    return [*place, "extract.gap=2", "extract.shard_rows=3", *PAPER]
-
-
-def test_a_corrupt_frame_raises_in_one_line(damaged, command):
-    code, _, err = command(*damaged, "workers=1")
-    assert code == 2 and "Traceback" not in err and len(without_notes(err)) == 1, err
-    assert all(word in err for word in ("frame 3", "00003.png", "expected", "extract.on_error=skip")), err
-    assert [p.name for p in files("features")] == ["shard-00000.parquet"], "what was whole before it stays"
-    assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]
 
 
 @pytest.mark.parametrize(
@@ -269,61 +227,3 @@ def test_a_killed_worker_is_said(monkeypatch):
 
     with pytest.raises(ChildProcessError, match="memory for 1 workers"):
         list(engines.run_local(Deadly(), range(4), 1))
-
-
-@pytest.mark.slow
-def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
-    room = ["data.hw=[120,160]", "data.n_frames=6", "data.supersample=1", "data.step_m=0.04", "data.lidar=exact"]
-    room += ["method.n=256", "extract.columns=[T_1_from_0,pose_ok,problem]"]
-    code, out, err = command(*room, "out=chosen")
-    assert code == 0 and "6 rows" in out, err
-    rows = list(FeatureTable("chosen"))
-    assert [int(row["dhtorch.problem"]) for row in rows] == [1, 0, 0, 0, 0, 0], "the first has none before it"
-    command(*room, "extract.gap=1", "out=one")
-    gap = list(FeatureTable("one"))
-    assert all(torch.equal(rows[1][k], gap[1][k]) for k in gap[1]), "one earlier frame is asked as a pair"
-    length = {k: float(found[5]["dhtorch.T_1_from_0"][:3, 3].norm()) for k, found in (("chosen", rows), ("one", gap))}
-    assert rows[5]["dhtorch.pose_ok"] and length["chosen"] > 2 * length["one"], "a wider one is worth more"
-
-
-MAPS = ["data.hw=[96,128]", "data.depth_hw=[48,64]", "data.n_frames=3", "data.supersample=1", "data.path=lateral"]
-MAPS += [
-    "data.step_m=0.1",
-    "data.range_limit=2.0",
-    "method=map",
-    "method.n=256",
-    "extract.gap=2",
-    "extract.shard_rows=2",
-]
-
-
-@pytest.mark.slow
-def test_maps_are_written_read_back_and_resumed(command):
-    def call(refinements=0):
-        dense = f"extract.dense={{size: 48, planes: 12, max_sigma_rel: 0.3, refinements: {refinements}}}"
-        return command(*MAPS, "out=out", "extract.half=true", dense)
-
-    code, out, err = call()
-    assert code == 0 and "2 shards, 3 rows" in out, err
-    features = FeatureTable("out")
-    about = features.about["columns"]
-    wanted = {
-        k: ("float16", [36, 48], unit) for k, unit in (("depth_map", "m"), ("sigma_map", "m"), ("score_map", "1"))
-    }
-    wanted |= {k: ("uint8", [36, 48], "code") for k in ("source_map", "gate_map")}
-    assert {k: (about[k]["kind"], about[k]["shape"], about[k]["unit"]) for k in wanted} == wanted
-    assert all("0 = none, where a DepthMap has NaN" in about[k]["about"] for k in ("depth_map", "sigma_map"))
-    assert features.about["codes"]["source_map"]["3"] == "SWEPT"
-    rows = [{k.removeprefix("dhtorch."): x for k, x in row.items()} for row in features]
-    assert [3 in row["source_map"] for row in rows] == [False, False, True]
-    for row in rows:
-        assert all(
-            row[k].dtype == (torch.int32 if kind == "uint8" else torch.float32) for k, (kind, *_) in wanted.items()
-        )
-        assert row["depth_map"].any() and torch.equal(row["depth_map"] > 0, row["source_map"] > 0)
-        assert torch.equal(row["depth_map"], row["depth_map"].half().float())
-    before = contents("out")
-    Path("out/shard-00001.parquet").unlink()
-    assert "2 shards (1 left untouched), 3 rows" in call()[1] and contents("out") == before
-    code, _, err = call(refinements=1)
-    assert code == 2 and "extract.dense.refinements 0 there, 1 here" in err

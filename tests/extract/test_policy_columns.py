@@ -148,14 +148,6 @@ def test_videos_card_and_groot_description_are_there_and_it_reads_back_without_a
     assert "63.75 / channel_0" in card and "decode_geometry_image" in card and f"{N_POINTS} points" in card
 
 
-@pytest.mark.slow
-def test_a_second_run_writes_the_same_bytes(source, tmp_path):
-    for name in ("a", "b"):
-        assert main(["enrich", str(source), str(tmp_path / name), *QUICK, COLUMNS, "max_frames=2"]) == 0
-    files, more = (read_videos(tmp_path / name)[1] for name in ("a", "b"))
-    assert [file.read_bytes() for file in files] == [file.read_bytes() for file in more]
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [

@@ -169,18 +169,6 @@ def test_rows_are_stored_in_groups_of_sixteen_or_fewer_where_maps_are_large(map_
     assert all(features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"]) for k in range(n))
 
 
-def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
-    def broken():
-        yield row(0)
-        (unfinished,) = tmp_path.iterdir()
-        assert unfinished.name.startswith(".shard-00000.parquet."), "not under its name before it is whole"
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        shards.write_shard(tmp_path, ShardSpec(0, 1, range(2)), broken(), columns.feature_columns(N, P), SHARED)
-    assert not list(tmp_path.iterdir())
-
-
 def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):
     pieces = [[row(0)], [row(1, problem=1), row(2)], [row(3)]]
     folder, twin = (written(tmp_path / name, pieces) for name in ("out", "twin"))

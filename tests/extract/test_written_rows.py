@@ -1,8 +1,5 @@
 """Every number of an enriched set stands in the row of its own frame and camera: rows, tables and folders of few pixels."""
 
-from types import SimpleNamespace
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +7,6 @@ from support.stub_recordings import Load, frame, recording
 from support.stub_samples import FixedEstimate, N, Stub
 
 pytest.importorskip("pyarrow")
-import pyarrow as pa
 import pyarrow.parquet as parquet
 
 from dhtorch.data.io.decode import decode_image
@@ -19,7 +15,6 @@ from dhtorch.extract.engines import filter_rows
 from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, map_columns
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.shards import write_shard
-from dhtorch.extract.step_set import RldsSource
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
 
@@ -73,42 +68,3 @@ def test_an_instant_with_an_unreadable_frame_takes_no_row(on_error, tmp_path):
         ):
             assert np.array_equal(decode_image(cell["bytes"], "a cell"), frame(40 + i).image[0].numpy())
             assert np.array_equal(pose, se3.to_matrix(scenes[1].recording.poses[i : i + 1])[0].flatten())
-
-
-class Steps:
-    """An episode of 19 steps whose numbers name their step; one feature is called as a column of every table."""
-
-    n, instruction, about = 19, "text", {"split": "train", "number": 3}
-    features: ClassVar = {
-        "action": SimpleNamespace(kind="tensor", dtype="float32", shape=(2,)),
-        "timestamp": SimpleNamespace(kind="tensor", dtype="float32", shape=(1,)),
-        "text": SimpleNamespace(kind="text"),
-        "note": SimpleNamespace(kind="text"),
-        "observation/image_0": SimpleNamespace(kind="image"),
-    }
-
-    def values(self, name, steps):
-        if name in ("text", "note"):
-            return [f"{name} {i // 10}" for i in steps]
-        if name == "observation/image_0":
-            return [(b"\xff\xd8\xff\xe0", b"\x89PNG")[i % 2] for i in steps]
-        size = self.features[name].shape[0]
-        return np.stack([np.full(size, i, np.float32) + 100 * np.arange(size, dtype=np.float32) for i in steps])
-
-
-def test_every_step_of_a_robot_has_its_own_values():
-    tasks = ["text 1"]  # of an episode before
-    source = RldsSource([None], [3], 10.0, cached={0: Steps()})
-    tables = list(source.batches(0, tasks))
-    assert [table.num_rows for table in tables] == [8, 8, 3]
-    table = pa.concat_tables(tables).to_pydict()
-    assert table["action"] == [[float(i), 100.0 + i] for i in range(19)]
-    assert table["source.timestamp"] == [float(i) for i in range(19)]
-    assert table["frame_index"] == list(range(19))
-    assert np.allclose(table["timestamp"], np.arange(19) / 10)
-    assert tasks == ["text 1", "text 0"] and table["task_index"] == [1] * 10 + [0] * 9
-    assert table["note"] == [f"note {i // 10}" for i in range(19)] and "text" not in table
-    ends = [cell["path"].rpartition(".")[2] for cell in table["observation.images.image_0"]]
-    assert ends == [("jpg", "png")[i % 2] for i in range(19)], "as they are encoded"
-    few = pa.concat_tables(RldsSource([None], [3], 10.0, 11, {0: Steps()}).batches(0, [])).to_pydict()
-    assert few["frame_index"] == list(range(11)) and few["action"][10] == [10.0, 110.0]

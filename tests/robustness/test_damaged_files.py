@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import mmap
 import os
-import random
 import re
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,6 @@ from support import damage_harness as hostile
 from support.captures_by_format import SAMPLES as CAPTURES
 from support.other_inputs import OTHER_INPUTS
 
-from dhtorch import data
 from dhtorch.data import FormatError
 
 SAMPLES = CAPTURES | OTHER_INPUTS
@@ -165,30 +161,3 @@ def test_harness_sees(
         monkeypatch.setattr(hostile, "BYTES", 64 << 20)  # less to fill on a busy machine
     with pytest.raises(AssertionError, match=rf"mutant \d+ \(.*\): {kind}"):
         hostile.attack(_one_file, lambda path: _misread(path, misdeed), tmp_path, mutants=3)
-
-
-def test_harness_repeats_a_mutant(tmp_path: Path) -> None:
-    good: mutations.Capture = {
-        "a.json": b'{"a": [1, 2, 3]}',
-        "b.txt": b"1 2\n3 4\n",
-        "c/d.png": b"\x89PNG\r\n\x1a\n" + bytes(99),
-    }
-    one, two = ([mutations.mutate(good, random.Random(f"3/{i}")) for i in range(200)] for _ in range(2))
-    assert one == two and len({what for what, _ in one}) > 15
-    assert sum(want == good for _, want in one) < 20
-
-
-def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("a/b.bin", b"123")
-        archive.writestr("a/c.bin", b"456")
-    with zipfile.ZipFile(io.BytesIO(mutations.with_bomb(out.getvalue(), "a/b.bin"))) as archive:
-        assert archive.read("a/c.bin") == b"456" and archive.getinfo("a/b.bin").file_size == 1 << 30
-        with archive.open("a/b.bin") as member:
-            assert member.read(1000) == bytes(1000)
-
-
-def test_what_opens_is_what_reads(tmp_path: Path) -> None:
-    CAPTURES["tum"][0](tmp_path)
-    assert len(data.open(tmp_path)) == 3

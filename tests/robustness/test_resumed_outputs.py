@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("pyarrow")
@@ -15,7 +14,7 @@ pytest.importorskip("av")
 from pyarrow import parquet
 from support import writers
 from support.dataset_folders import read_files, read_rows
-from support.known_episodes import CAMERAS, LENS, episodes, pose, write_robot
+from support.known_episodes import CAMERAS, LENS, episodes, write_robot
 
 from dhtorch.cli import run
 from dhtorch.extract.enriched import MapRowDataset
@@ -94,14 +93,6 @@ def test_an_enriched_set_that_is_enriched_again_has_its_own_records_and_can_be_r
     assert read_files(twice) == whole, "resumed"
 
 
-def test_without_a_report_there_is_no_report_of_another(robot: Path, tmp_path: Path) -> None:
-    assert enrich(robot, tmp_path / "set", "data=lerobot", f"data.camera={FRONT}", "report=false") == 0
-    assert (
-        not list((tmp_path / "set" / "meta").glob("report*"))
-        and "foreign" in read_files(robot)["meta/report.html"].decode()
-    )
-
-
 # ----------------------------------------------------------------------------------------------------------- long names
 
 
@@ -129,11 +120,3 @@ def test_a_capture_of_a_long_name_runs_as_any_other(capture: Path, tmp_path: Pat
     words = ["data=auto", f"data.root={long}", "pairs.gap=1", "method=paper", "method.n=64", "figures=false"]
     assert run.main(["run", *words, f"output={out}"]) == 0
     assert json.loads((out / "result.json").read_text())["data"]["scenes"] == [250 * "n"]
-
-
-def test_the_known_frames_differ_in_every_number() -> None:
-    frames = [frame for camera in (0, 1) for episode in episodes(camera) for frame in episode]
-    for name in ("image", "depth", "time"):
-        assert len({getattr(frame, name).numpy().tobytes() for frame in frames}) == len(frames), name
-    poses = [pose(camera, e, i) for camera in (0, 1) for e in (0, 1) for i in range(9)]
-    assert len({tuple(np.ravel(T)) for T in poses}) == len(poses)

@@ -29,8 +29,10 @@ from support.known_episodes import CAMERAS, FPS, HW, LENGTHS, LENS, TASKS
 from support.read_back import Array, linear, read_glb, read_ply, same
 from support.writers.simulator_hdf5 import write_simulator_hdf5
 
+from dhtorch import data
 from dhtorch.cli.run import main
 from dhtorch.codes import Gate, Hole, Source
+from dhtorch.extract.step_set import RldsSource
 from dhtorch.viz.viewer import html
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud, SweptPointCloud
 
@@ -169,6 +171,15 @@ def test_statistics_are_those_of_the_known_numbers(robot: tuple[int, Path]) -> N
         lines = read_lines(root / "meta" / "episodes_stats.jsonl")
         sets += [(line["stats"], [row for row in known.rows() if row[0] == line["episode_index"]]) for line in lines]
         assert len(sets) == 3
+        shapes = {
+            np.shape(v)
+            for stats, _ in sets[1:]
+            for n, x in stats.items()
+            if "image" in n
+            for k, v in x.items()
+            if k != "count"
+        }
+        assert shapes == {(3, 1, 1)}, "what LeRobot 0.3 asks of every feature with image in its name"
     for stats, rows in sets:
         columns = {
             "action": [known.action(e, i) for e, i in rows],
@@ -232,6 +243,7 @@ def test_steps_of_rlds_keep_every_number(tmp_path: Path) -> None:
     writers.write_rlds(source, known.episodes(1, lens=False))
     out = enrich(source, tmp_path / "set", "data=rlds", f"fps={FPS}")
     rows, key = read_rows(out), "observation.images.image_0"
+    said = parquet.read_table(out / "meta" / "tasks.parquet").to_pylist()
     assert len(rows) == sum(LENGTHS)
     for index, (row, (e, i)) in enumerate(zip(rows, known.rows(), strict=True)):
         own = {"index": index, "episode_index": e, "frame_index": i, "timestamp": np.float32(i / FPS)}
@@ -240,6 +252,18 @@ def test_steps_of_rlds_keep_every_number(tmp_path: Path) -> None:
         hold(row, own | {"observation.image_0_T_world_from_cam": (known.pose(1, e, i), 1e-6)})
         assert np.array_equal(pixels(row[key]["bytes"]), known.picture(1, e, i))
         check_maps(row, 1, e, i, f"{key}_depth")
+        assert row[key]["bytes"] in next(source.glob("*.tfrecord*")).read_bytes(), "not encoded again"
+    about = read_lines(out / "meta" / "source_episodes.jsonl")
+    assert [(row["split"], row["number"], row["episode_id"]) for row in about] == [("train", 0, -1), ("train", 1, -1)]
+    few, tasks = RldsSource(data.open_all(source, "rlds"), [0, 1], FPS, 9), ["before"]
+    tables = [table for k in range(2) for table in few.batches(k, tasks)]
+    assert (
+        [table.num_rows for table in tables] == [8, 1] * 2
+        and tasks[0] == "before"
+        and len(tasks) == 1 + len({*tasks[1:]})
+    )
+    texts = [tasks[k] for table in tables for k in table["task_index"].to_pylist()]
+    assert texts == [said[row["task_index"]]["task"] for row in rows[:9] + rows[LENGTHS[0] :]]
 
 
 def test_nerfstudio_folders_are_of_their_own_camera_and_episode(tmp_path: Path) -> None:
