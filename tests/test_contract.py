@@ -591,7 +591,6 @@ ELSEWHERE = {
             "fuse_recording_grids",
             "measure_coverage",
             "view_from_sensor",
-            "view_from_recovered",
             "view_from_sweep",
             "view_from_depth_map",
         )

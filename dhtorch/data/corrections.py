@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class Corrections:
         if self.depth_unit is not None:
             metres = parse_unit(self.depth_unit)
             read_as = 1.0 if recording.depth_unit is None else recording.depth_unit.metres
-            load = _ScaledDepth(recording.load, metres / read_as) if metres != read_as else recording.load
+            load = partial(_scale_depth, recording.load, metres / read_as) if metres != read_as else recording.load
             recording = replace(recording, load=load, depth_unit=DepthUnit(metres, "option depth_unit"))
         if self.depth_lag:
             recording = _shift_depth(recording, self.depth_lag)
@@ -80,29 +81,16 @@ class Corrections:
         return recording if remark is None else replace(recording, report=(*recording.report, remark))
 
 
-@dataclass(frozen=True)
-class _ScaledDepth:
-    """Position → frame with its depth times a factor."""
-
-    load: Callable[[int], Frame]
-    factor: float
-
-    def __call__(self, i: int) -> Frame:
-        frame = self.load(i)
-        return frame.replace(depth=frame.depth * self.factor)
+def _scale_depth(load: Callable[[int], Frame], factor: float, i: int) -> Frame:
+    """Frame at a position with its depth times a factor."""
+    frame = load(i)
+    return frame.replace(depth=frame.depth * factor)
 
 
-@dataclass(frozen=True)
-class _LaggedDepth:
-    """Position → frame with the depth of another position: that of ``lag`` frames later."""
-
-    load: Callable[[int], Frame]
-    lag: int
-    first: int
-
-    def __call__(self, i: int) -> Frame:
-        frame, later = self.load(i + self.first), self.load(i + self.first + self.lag)
-        return frame.replace(depth=later.depth, conf=later.conf, depth_camera=later.depth_camera)
+def _lag_depth(load: Callable[[int], Frame], lag: int, first: int, i: int) -> Frame:
+    """Frame at a position with the depth of another position: that of ``lag`` frames later."""
+    frame, later = load(i + first), load(i + first + lag)
+    return frame.replace(depth=later.depth, conf=later.conf, depth_camera=later.depth_camera)
 
 
 def _shift_depth(recording: Recording, lag: int) -> Recording:
@@ -113,7 +101,7 @@ def _shift_depth(recording: Recording, lag: int) -> Recording:
     kept = slice(first, first + n)
     return replace(
         recording,
-        load=_LaggedDepth(recording.load, lag, first),
+        load=partial(_lag_depth, recording.load, lag, first),
         number=recording.number[kept],
         times=None if recording.times is None else recording.times[kept],
         poses=None if recording.poses is None else recording.poses[kept],

@@ -6,7 +6,7 @@ Pixel centres are at integers here and at half-integers in nerfstudio, whose cam
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 #: Step in m of the depth images: nerfstudio's ``depth_unit_scale_factor``.
-_DEPTH_UNIT_M = 1e-3
+DEPTH_UNIT_M = 1e-3
 
 #: Relative sigma whose confidence is one half.
 _HALF_CONFIDENCE_SIGMA = 0.1
@@ -59,19 +59,9 @@ def make_nerfstudio_frame(
     }
 
 
-def make_transforms(shots: Sequence[Mapping[str, Any]], **more: Any) -> dict[str, Any]:
-    """Contents of ``transforms.json``; ``more`` are further entries, which nerfstudio ignores."""
-    return {
-        "camera_model": "OPENCV",
-        "depth_unit_scale_factor": _DEPTH_UNIT_M,
-        **more,
-        "frames": [dict(s) for s in shots],
-    }
-
-
 def quantise_nerfstudio_depth(depth: np.ndarray) -> np.ndarray:
     """Depth (h, w) in m → uint16 steps, 0 = no depth; depths beyond the last step become 0."""
-    z = np.rint(np.asarray(depth, np.float64) / _DEPTH_UNIT_M)
+    z = np.rint(np.asarray(depth, np.float64) / DEPTH_UNIT_M)
     return np.where((z >= 1) & (z <= 65534), z, 0).astype(np.uint16)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 from dhtorch.data.recording import LazySequence, Recording
 from dhtorch.data.scene import Scene
@@ -54,18 +55,12 @@ def subsample_recording(recording: Recording, every: int, max_frames: int | None
     kept = {field.name: getattr(recording, field.name) for field in fields(Recording)}  # a subclass has other arguments
     kept |= {
         "number": recording.number[part],
-        "load": recording.load if every == 1 else _EveryFrame(recording.load, every),
+        "load": recording.load if every == 1 else partial(_load_every, recording.load, every),
     }
     kept |= {"times": None if times is None else times[part], "poses": None if poses is None else poses[part]}
     return Recording(**kept)
 
 
-@dataclass(frozen=True)
-class _EveryFrame:
-    """Loads the frame at ``every`` times the position; it can be pickled, as data-loader processes need."""
-
-    load: Callable[[int], Frame]
-    every: int
-
-    def __call__(self, position: int) -> Frame:
-        return self.load(position * self.every)
+def _load_every(load: Callable[[int], Frame], every: int, position: int) -> Frame:
+    """Frame at ``every`` times the position."""
+    return load(position * every)

@@ -72,7 +72,12 @@ class NerfstudioTarget:
             cameras = {view.name: tally.summary()}
             summary = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
             cloud.write(folder / _POINTS_FILE)
-            contents = nerfstudio.make_transforms(shots, dhtorch=summary, ply_file_path=_POINTS_FILE)
+            contents = {
+                "camera_model": "OPENCV",
+                "depth_unit_scale_factor": nerfstudio.DEPTH_UNIT_M,
+                "dhtorch": summary,
+            }
+            contents |= {"ply_file_path": _POINTS_FILE, "frames": shots}
             storage.write_json(self._file(k, key), contents)
         written = self.own(k)
         assert written is not None  # just written

@@ -234,9 +234,22 @@ class LeRobotSource(DatasetSource):
 
     def words(self, i: int) -> list[str] | None:
         """Task texts of episode ``i`` in ``meta/``; None = none."""
-        number = int(self.episodes.numbers[i])
+        episode_tasks: dict[int, list[str]] = {}
         with doors.restrict_links(self.bounds):
-            return _read_episode_tasks(self.meta).get(number)
+            if self.meta.version == 2:
+                lines = self.meta.root / "meta" / "episodes.jsonl"
+                for text in files.read_text(lines).splitlines():
+                    row = files.decode_json(text, lines) if text.strip() else {}
+                    if isinstance(row, dict) and isinstance(row.get("tasks"), list):
+                        number = files.get_entry(row, "episode_index", int, lines)
+                        episode_tasks[number] = [str(task) for task in row["tasks"]]
+                return episode_tasks.get(int(self.episodes.numbers[i]))
+            for table in sorted((self.meta.root / "meta" / "episodes").glob("*/*.parquet")):
+                if "tasks" in read_parquet_header(table).columns:
+                    content = read_columns(table, ["episode_index", "tasks"])
+                    rows = zip(np.asarray(content["episode_index"]).tolist(), content["tasks"], strict=True)
+                    episode_tasks |= {number: [*map(str, tasks)] for number, tasks in rows if isinstance(tasks, list)}
+            return episode_tasks.get(int(self.episodes.numbers[i]))
 
     @property
     def more(self) -> dict[str, Path]:
@@ -267,24 +280,6 @@ def _read_tasks(meta: LeRobotMeta) -> list[str]:
     if any(not 0 <= k < _MAX_TASKS for k in tasks):
         raise FormatError(lines if lines.is_file() else table, "task_index", min(tasks), f"0 to {_MAX_TASKS - 1}")
     return [tasks.get(k, "") for k in range(max(tasks, default=0) + 1)]
-
-
-def _read_episode_tasks(meta: LeRobotMeta) -> dict[int, list[str]]:
-    """Metadata -> episode number → task texts, for episodes that list them."""
-    lines, episode_tasks = meta.root / "meta" / "episodes.jsonl", {}
-    if meta.version == 2:
-        for text in files.read_text(lines).splitlines():
-            row = files.decode_json(text, lines) if text.strip() else {}
-            if isinstance(row, dict) and isinstance(row.get("tasks"), list):
-                number = files.get_entry(row, "episode_index", int, lines)
-                episode_tasks[number] = [str(task) for task in row["tasks"]]
-        return episode_tasks
-    for table in sorted((meta.root / "meta" / "episodes").glob("*/*.parquet")):
-        if "tasks" in read_parquet_header(table).columns:
-            content = read_columns(table, ["episode_index", "tasks"])
-            rows = zip(np.asarray(content["episode_index"]).tolist(), content["tasks"], strict=True)
-            episode_tasks |= {number: [*map(str, tasks)] for number, tasks in rows if isinstance(tasks, list)}
-    return episode_tasks
 
 
 def has_frame_rate(recording: Recording) -> bool:

@@ -51,10 +51,13 @@ def geometry_feature(hw: tuple[int, int], fps: float) -> FeatureSpec:
     return {**lerobot.image_feature(hw, **video, geometry_image=decoding), "dtype": "video"}
 
 
-def cloud_feature() -> FeatureSpec:
-    """LeRobot feature of a point cloud."""
-    about = {"unit": "m", "axes": "camera of the picture: x right, y down, z forward", "no_depth": "all points 0"}
-    return {"dtype": "float32", "shape": [N_POINTS, 3], "names": ["point", "xyz"], "info": about}
+#: LeRobot feature of a point cloud.
+CLOUD_FEATURE: Final[FeatureSpec] = {
+    "dtype": "float32",
+    "shape": [N_POINTS, 3],
+    "names": ["point", "xyz"],
+    "info": {"unit": "m", "axes": "camera of the picture: x right, y down, z forward", "no_depth": "all points 0"},
+}
 
 
 class PolicyColumnWriter:
@@ -80,13 +83,22 @@ class PolicyColumnWriter:
                 else {name: decode_map(row[name], name, self.view.map_hw) for name in ("depth", "sigma", "source")}
             )
             if self.append is not None:
-                picture = encode_geometry(maps, self.view)
+                picture = np.zeros((*self.view.hw, 3), np.uint8)
+                if maps is not None:  # of the picture's size, by nearest pixels
+                    image = policy_inputs.geometry_image(*map(torch.from_numpy, maps.values())).permute(1, 2, 0).numpy()
+                    sizes = zip(self.view.hw, self.view.map_hw, strict=True)
+                    v, u = ((2 * np.arange(n) + 1) * m // (2 * n) for n, m in sizes)
+                    picture = image[v[:, None], u]
                 self.append(picture, time)
                 self._count(self.keys["geometry_image"], picture.reshape(-1, 3) / 255)
             if "point_cloud" in self.keys:
                 points = np.zeros((N_POINTS, 3), np.float32)
                 if maps is not None and row is not None and maps["depth"].any():
-                    points = sample_cloud(maps["depth"], row["K"], self.view)
+                    lens = torch.tensor(self.view.lens, dtype=torch.float64) if self.view.lens else None
+                    camera = cam.from_matrix(torch.tensor(row["K"], dtype=torch.float64).view(1, 3, 3))
+                    K = cam.to_matrix(cam.resize(camera, self.view.hw, self.view.map_hw))[0]
+                    depth = torch.from_numpy(maps["depth"]).double()
+                    points = policy_inputs.point_cloud(depth, K, n=N_POINTS, distortion=lens).float().numpy()
                     self._count(self.keys["point_cloud"], points)
                 clouds.append(points)
         return {self.keys["point_cloud"]: lerobot.nested_lists(np.stack(clouds))} if clouds else {}
@@ -94,24 +106,6 @@ class PolicyColumnWriter:
     def _count(self, column: str, values: np.ndarray) -> None:
         here = FeatureMoments.of(values)
         self.moments[column] = self.moments[column] + here if column in self.moments else here
-
-
-def encode_geometry(maps: Mapping[str, np.ndarray] | None, view: DatasetCamera) -> np.ndarray:
-    """Maps of a frame (None = unreadable) -> geometry image (h, w, 3) of the picture's size, by nearest pixels."""
-    if maps is None:
-        return np.zeros((*view.hw, 3), np.uint8)
-    image = policy_inputs.geometry_image(*(torch.from_numpy(maps[name]) for name in ("depth", "sigma", "source")))
-    v, u = ((2 * np.arange(n) + 1) * m // (2 * n) for n, m in zip(view.hw, view.map_hw, strict=True))
-    return image.permute(1, 2, 0).numpy()[v[:, None], u]
-
-
-def sample_cloud(depth: np.ndarray, K: Sequence[float], view: DatasetCamera) -> np.ndarray:
-    """Depth map (h, w) m and K of the picture by rows -> points (N_POINTS, 3) float32 m in the camera."""
-    lens = torch.tensor(view.lens, dtype=torch.float64) if view.lens else None
-    camera = cam.from_matrix(torch.tensor(K, dtype=torch.float64).view(1, 3, 3))
-    K_map = cam.to_matrix(cam.resize(camera, view.hw, view.map_hw))[0]
-    points = policy_inputs.point_cloud(torch.from_numpy(depth).double(), K_map, n=N_POINTS, distortion=lens)
-    return points.float().numpy()
 
 
 def make_modality(root: Path | None, features: Mapping[str, FeatureSpec], videos: Mapping[str, str]) -> dict[str, Any]:
@@ -126,19 +120,19 @@ def make_modality(root: Path | None, features: Mapping[str, FeatureSpec], videos
         FormatError: a file that is not an object of objects.
     """
     path = Path(MODALITY_FILE) if root is None else root / MODALITY_FILE
-    modality = _default_modality(features) if root is None else files.read_json(path)
+    if root is None:  # state and action as one part each, and every video by its name
+        parts = {"state": "observation.state", "action": "action"}
+        modality: dict[str, Any] = {
+            part: {part: {"start": 0, "end": int(np.prod(features[key]["shape"]))}}
+            for part, key in parts.items()
+            if key in features
+        }
+        names = (key for key, feature in features.items() if feature["dtype"] == "video")
+        modality["video"] = {key.removeprefix("observation.images."): {"original_key": key} for key in names}
+        modality["annotation"] = {"human.action.task_description": {"original_key": "task_index"}}
+    else:
+        modality = files.read_json(path)
     if not isinstance(modality, dict) or not isinstance(modality.get("video", {}), dict):
         raise FormatError(path, "video", "no object", "names of videos, each with original_key")
     added = {name: {"original_key": key} for name, key in videos.items()}
     return {**modality, "video": {**modality.get("video", {}), **added}}
-
-
-def _default_modality(features: Mapping[str, FeatureSpec]) -> dict[str, Any]:
-    """State and action as one part each, and every video by its name."""
-    modality: dict[str, Any] = {}
-    for part, key in (("state", "observation.state"), ("action", "action")):
-        if key in features:
-            modality[part] = {part: {"start": 0, "end": int(np.prod(features[key]["shape"]))}}
-    videos = (key for key, feature in features.items() if feature["dtype"] == "video")
-    modality["video"] = {key.removeprefix("observation.images."): {"original_key": key} for key in videos}
-    return {**modality, "annotation": {"human.action.task_description": {"original_key": "task_index"}}}

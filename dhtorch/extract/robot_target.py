@@ -90,8 +90,20 @@ class LeRobotTarget:
             import_optional("av")
         self.source_features: dict[str, FeatureSpec] = {} if origin is None else origin.features
         self.unlisted = [] if as_images else pixel_columns.find_one_channel(self.source_features, "video", views)
-        self.pixels = {} if origin is None or as_images else self._pixel_features(origin)
+        #: Image columns of the source that become numbers -> their features, by the type of the first image.
+        self.pixels: dict[str, FeatureSpec] = {}
+        if origin is not None and not as_images:
+            one_channel = pixel_columns.find_one_channel(self.source_features, "image", views)
+            first = next(iter(origin.batches(0, []))) if one_channel else None
+            with doors.restrict_links(origin.bounds):
+                for name in one_channel:
+                    cell = first.column(name)[0].as_py()
+                    self.pixels[name] = pixel_columns.read_pixel_feature(
+                        name, self.source_features[name], cell, origin.root
+                    )
         self.keys = {view.key: self._keys(view) for view in views.values()}
+        #: Camera -> feature of its geometry images.
+        self.geometry = {view: keys["geometry_image"] for view, keys in self.keys.items() if "geometry_image" in keys}
         self.renumbered = cut or list(numbers) != list(range(len(numbers)))
         for name in (*self.source_features, *views):
             if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
@@ -106,19 +118,6 @@ class LeRobotTarget:
                     )
 
     # -------------------------------------------------------------------------------------------------- the columns
-
-    def _pixel_features(self, origin: DatasetSource) -> dict[str, FeatureSpec]:
-        """Image columns of the source that become numbers -> their features, by the type of the first image."""
-        keys = pixel_columns.find_one_channel(self.source_features, "image", self.views)
-        if not keys:
-            return {}
-        first = next(iter(origin.batches(0, [])))
-        cells = {key: first.column(key)[0].as_py() for key in keys}
-        with doors.restrict_links(origin.bounds):
-            return {
-                key: pixel_columns.read_pixel_feature(key, self.source_features[key], cell, origin.root)
-                for key, cell in cells.items()
-            }
 
     def _keys(self, view: DatasetCamera) -> dict[str, str]:
         """Camera -> added columns: kind → column name."""
@@ -147,11 +146,21 @@ class LeRobotTarget:
         features: dict[str, FeatureSpec] = {}
         numbers = {key: number_column(c, self.n) for key, c in NUMBER_COLUMNS.items()}
         for key, view in self.views.items():
+            maps: dict[str, FeatureSpec] = {}
+            for name, spec in MAP_FILES.items():
+                codes = {} if spec.codes is None else {str(k): word.lower() for k, word in names(spec.codes).items()}
+                if spec.enrich == "tiff":
+                    step = self.step / MAP_STEPS.get(name, 1)
+                    maps[name] = lerobot.depth_feature(view.map_hw, step, as_image=self.as_images)
+                elif self.as_images:
+                    maps[name] = lerobot.image_feature(view.map_hw, 1, codes=codes)
+                else:
+                    maps[name] = lerobot.map_feature(view.map_hw, "uint8", codes=codes)
             by_kind: dict[str, FeatureSpec] = {
-                **{name: self._map_feature(name, view) for name in MAP_FILES},
+                **maps,
                 **{key: lerobot.number_feature(c.kind, math.prod(c.shape)) for key, c in numbers.items()},
                 "geometry_image": policy_columns.geometry_feature(view.hw, self.fps),
-                "point_cloud": policy_columns.cloud_feature(),
+                "point_cloud": policy_columns.CLOUD_FEATURE,
                 "K": lerobot.number_feature("float64", 9),
                 "pose": lerobot.number_feature("float64", 16),
             }
@@ -159,17 +168,6 @@ class LeRobotTarget:
                 features[key] = lerobot.image_feature(view.hw)
             features |= {column: by_kind[kind] for kind, column in self.keys[key].items()}
         return features
-
-    def _map_feature(self, name: str, view: DatasetCamera) -> FeatureSpec:
-        spec = MAP_FILES[name]
-        if spec.enrich == "tiff":
-            step = self.step / MAP_STEPS.get(name, 1)
-            return lerobot.depth_feature(view.map_hw, step, as_image=self.as_images)
-        table = {} if spec.codes is None else names(spec.codes)
-        codes = {str(k): name.lower() for k, name in table.items()}
-        if self.as_images:
-            return lerobot.image_feature(view.map_hw, 1, codes=codes)
-        return lerobot.map_feature(view.map_hw, "uint8", codes=codes)
 
     def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
         """LeRobot features of all columns of the tables, and of the videos."""
@@ -195,7 +193,7 @@ class LeRobotTarget:
             doors.check_regular_file(self.file(k))
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
-            return summary if summary["key"] == self.key and all(map(is_whole, self._geometry_files(k))) else None
+            return summary if summary["key"] == self.key and all(map(is_whole, self._videos(k))) else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
@@ -263,7 +261,11 @@ class LeRobotTarget:
                 )
                 table = table.set_column(table.column_names.index(key), key, pixels)
             numbers = part.column("frame_index").to_pylist()
-            times = part.column("timestamp").to_pylist() if "timestamp" in part.column_names else self._times(numbers)
+            times = (
+                part.column("timestamp").to_pylist()
+                if "timestamp" in part.column_names
+                else [i / self.fps for i in numbers]
+            )
             for key, rows in rows_by_camera.items():
                 camera_rows = [rows.take(i) for i in numbers]
                 for row in camera_rows:
@@ -313,7 +315,7 @@ class LeRobotTarget:
                 cells = {
                     key: pyarrow.array(pictures),
                     **self._cells(key, rows, done),
-                    **policy[key].add(rows, self._times(index)),
+                    **policy[key].add(rows, (index / self.fps).tolist()),
                 }
                 for column, values in cells.items():
                     table = table.append_column(column, values)
@@ -382,11 +384,13 @@ class LeRobotTarget:
         """Summary of a complete episode."""
         ranges: dict[str, LogHistogram] = {}
         for key, tally in tallies.items():
-            image = tally.image_moments()
-            moments |= {} if image is None else {key: image}
-            for name, (map_moments, histogram) in tally.map_stats().items():
-                if name in self.keys[key]:
-                    moments[self.keys[key][name]], ranges[self.keys[key][name]] = map_moments, histogram
+            if tally.moments is None:
+                continue
+            moments[key] = FeatureMoments(*(x[2:5] for x in tally.moments))  # of red, green and blue
+            for place, name in enumerate(("depth", "sigma")):
+                if column := self.keys[key].get(name):
+                    moments[column] = FeatureMoments(*(x[place : place + 1] for x in tally.moments))
+                    ranges[column] = tally.ranges[place]
         episode_tasks = None if self.origin is None else self.origin.words(k)
         summary: Row = storage.to_strict_json(
             {
@@ -414,24 +418,14 @@ class LeRobotTarget:
         with open_lossless_video(path, view.hw, self.fps) as append:
             yield PolicyColumnWriter(keys, view, append)
 
-    def _times(self, numbers: Sequence[int] | np.ndarray) -> list[float]:
-        """Frame numbers of an episode -> times in s by the frame rate."""
-        return [float(i / self.fps) for i in numbers]
-
     def _new_clip(self, k: int, length: int) -> lerobot.VideoSegment:
         """Segment of a video that is written for the ``k``-th episode alone."""
         return lerobot.VideoSegment(*divmod(k, lerobot.FILES_PER_CHUNK), 0.0, length / self.fps)
 
-    def _geometry_videos(self) -> dict[str, str]:
-        """Name of the camera → feature of its geometry images."""
-        kind = "geometry_image"
-        return {f"{view.name}_{kind}": self.keys[key][kind] for key, view in self.views.items() if kind in self.maps}
-
-    def _geometry_files(self, k: int) -> list[Path]:
+    def _videos(self, k: int) -> list[Path]:
         """Videos of geometry images of the ``k``-th episode."""
         clip = self._new_clip(k, 0)
-        keys = self._geometry_videos().values()
-        return [self.root / lerobot.episode_video_path(self.version, key, clip, k) for key in keys]
+        return [self.root / lerobot.episode_video_path(self.version, x, clip, k) for x in self.geometry.values()]
 
     def _copy_videos(self, k: int, length: int) -> None:
         """Copy the videos of an episode unchanged, except those that are there with all bytes."""
@@ -453,7 +447,7 @@ class LeRobotTarget:
     def planned_files(self, missing: Sequence[int]) -> list[Path]:
         """As :meth:`DatasetTarget.planned_files`."""
         names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "source_features.json", "intrinsics.json")
-        videos = [file for k in missing for file in self._geometry_files(k)]
+        videos = [file for k in missing for file in self._videos(k)]
         files = [*(self.file(k) for k in missing), *videos, *(self.root / "meta" / name for name in names)]
         return [*files, self.root / policy_columns.MODALITY_FILE] if videos else files
 
@@ -461,8 +455,16 @@ class LeRobotTarget:
         """As :meth:`DatasetTarget.finish`."""
         parquet = import_optional("pyarrow.parquet")
         features = self.features(parquet.read_schema(self.file(0)).names)
-        self._write_lenses()
-        self._write_about(owns)
+        # Distortion coefficients, which the format cannot hold, with the source's entries of other cameras.
+        others = {} if self.origin is None else self.origin.meta_file("intrinsics.json")
+        lenses = {key: entry for key, entry in others.items() if key not in self.views}
+        lenses |= {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
+        if lenses:
+            storage.write_json(self.root / "meta" / "intrinsics.json", lenses)
+        if any(summary["about"] for summary in owns):  # metadata of source episodes that the format cannot hold
+            rows = [{"episode_index": k, **summary["about"]} for k, summary in enumerate(owns)]
+            text = "".join(storage.dump_strict_json(row) + "\n" for row in rows)
+            storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
         if self.unlisted:
             unlisted = {key: self.source_features[key] for key in self.unlisted}
             storage.write_json(self.root / "meta" / "source_features.json", unlisted)
@@ -471,7 +473,9 @@ class LeRobotTarget:
             self._copy_videos(k, summary["length"])  # those of episodes that were complete before
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / (SOURCE_CARD if name == "README.md" else name))
-        if videos := self._geometry_videos():
+        if videos := {
+            f"{view.name}_geometry_image": self.geometry[key] for key, view in self.views.items() if self.geometry
+        }:
             has_modality = self.origin is not None and policy_columns.MODALITY_FILE in self.origin.more
             source = self.origin.root if self.origin is not None and has_modality else None
             modality = policy_columns.make_modality(source, features, videos)
@@ -484,7 +488,7 @@ class LeRobotTarget:
                 tasks=summary["tasks"],
                 videos={
                     **{key: clip for key, (_, clip) in self._clips(k, summary["length"]).items()},
-                    **{key: self._new_clip(k, summary["length"]) for key in self._geometry_videos().values()},
+                    **dict.fromkeys(self.geometry.values(), self._new_clip(k, summary["length"])),
                 },
                 stats=self._stats([summary], features) if self.version == 2 else {},
             )
@@ -526,7 +530,11 @@ class LeRobotTarget:
             elif total is not None:
                 entry = total.stats(frames, (len(total.n), 1, 1) if is_picture else (len(total.n),))
             if entry is None and is_picture:
-                entry = self._source_stats(name, pixel_columns.count_channels(name, feature), frames)
+                shape = (pixel_columns.count_channels(name, feature), 1, 1)
+                source = {} if self.origin is None else self.origin.meta_file("stats.json").get(name, {})
+                shapes = [np.shape(source.get(k) or 0) for k in ("mean", "std")] if isinstance(source, dict) else []
+                entry = LogHistogram.parse([]).stats(FeatureMoments.of(np.zeros((0, 1))), frames, shape)
+                entry = {**source, "count": [frames]} if shapes == [shape] * 2 else entry
             if self.version == 2 and "image" in name and entry is not None:
                 if not (is_map or is_picture):
                     continue
@@ -534,14 +542,6 @@ class LeRobotTarget:
             if entry is not None:
                 stats[name] = entry
         return stats
-
-    def _source_stats(self, name: str, channels: int, frames: int) -> dict[str, Any]:
-        """Statistics of a picture that was not read: the source's, else those that change nothing."""
-        entry = {} if self.origin is None else self.origin.meta_file("stats.json").get(name, {})
-        shapes = [np.shape(entry.get(k) or 0) for k in ("mean", "std")] if isinstance(entry, dict) else []
-        if shapes == [(channels, 1, 1)] * 2:
-            return {**entry, "count": [frames]}
-        return LogHistogram.parse([]).stats(FeatureMoments.of(np.zeros((0, 1))), frames, (channels, 1, 1))
 
     def _add_moments(self, moments: dict[str, FeatureMoments], table: Any) -> None:
         """Add to ``moments`` those of numbers, and of the first picture of every image column that no camera reads."""
@@ -578,19 +578,3 @@ class LeRobotTarget:
             if indices and indices == list(range(indices[0], indices[-1] + 1)):
                 consecutive[name] = f"{indices[0]}:{indices[-1] + 1}"
         return consecutive
-
-    def _write_about(self, owns: Sequence[Row]) -> None:
-        """Write the metadata of source episodes that the format cannot hold."""
-        if any(summary["about"] for summary in owns):
-            rows = [{"episode_index": k, **summary["about"]} for k, summary in enumerate(owns)]
-            text = "".join(storage.dump_strict_json(row) + "\n" for row in rows)
-            storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
-
-    def _write_lenses(self) -> None:
-        """Write distortion coefficients, which the format cannot hold, to the side-car file ``intrinsics.json``, with
-        the source's entries of other cameras."""
-        others = {} if self.origin is None else self.origin.meta_file("intrinsics.json")
-        entries = {key: entry for key, entry in others.items() if key not in self.views}
-        entries |= {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
-        if entries:
-            storage.write_json(self.root / "meta" / "intrinsics.json", entries)

@@ -78,17 +78,6 @@ class MapCounts:
         more |= {"recovered_sigma_rel_bins": self.ranges[2].pack()}
         return {"pixels": pixels.sum(0), "no_answer": no_answer.sum(0), **more}
 
-    def map_stats(self) -> dict[str, tuple[FeatureMoments, LogHistogram]]:
-        """Moments and histogram of depth and sigma; empty if no frame could be read."""
-        if self.moments is None:
-            return {}
-        moments = [FeatureMoments(*(x[k : k + 1] for x in self.moments)) for k in range(2)]
-        return dict(zip(("depth", "sigma"), zip(moments, self.ranges[:2], strict=True), strict=True))
-
-    def image_moments(self) -> FeatureMoments | None:
-        """Moments of red, green and blue; None if no frame could be read."""
-        return None if self.moments is None else FeatureMoments(*(x[2:5] for x in self.moments))
-
 
 def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
     """Shards -> their rows in order, one group in memory at a time."""

@@ -91,7 +91,11 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError, ImportError: bad options or data.
         KeyboardInterrupt: Ctrl-C; files of finished scenes are kept.
     """
-    _check_settings(settings)
+    # What would otherwise fail only after minutes.
+    file_from_world(settings["axes"], (0.0, 1.0, 0.0))
+    DenseSweep.from_options(settings["dense"])
+    if settings["mesh"] and not should_mesh(None):
+        raise ImportError("mesh: found no scikit-image, expected it: pip install scikit-image")
     sources = scenes_of(parts["data"])
     folder = Path(settings["output"])
     with open_output_folder(folder, "output") as output:
@@ -107,7 +111,15 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
                 written += write_mapped_scene(folder / source.name, mapped, settings)
                 mapped.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scene_rows)
                 scene_rows.append(mapped.row)
-                rows += [*_pair_rows(mapped), mapped.row]
+                common = {k: mapped.row[k] for k in ("scene", "method", "truth")}
+                rows += [
+                    {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
+                    | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in mapped.places.poses)}
+                    | ({} if a.swept is None else {**_count_swept([a.swept]), "map_hw": list(a.swept.hw)})
+                    | ({} if a.picked is None else a.picked.row())
+                    for a in mapped.answers
+                ]
+                rows.append(mapped.row)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{len(scene_rows)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
@@ -350,17 +362,6 @@ def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
     return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
 
 
-def _pair_rows(scene: MappedScene) -> list[Row]:
-    common = {k: scene.row[k] for k in ("scene", "method", "truth")}
-    return [
-        {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
-        | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in scene.places.poses)}
-        | ({} if a.swept is None else {**_count_swept([a.swept]), "map_hw": list(a.swept.hw)})
-        | ({} if a.picked is None else a.picked.row())
-        for a in scene.answers
-    ]
-
-
 def _describe_scene(row: Row, cell: float) -> str:
     """One line of text on a scene: frames, fragments, coverage and size of its map."""
     frames = format_count(row["n_frames"] + row["n_unplaced"], "frame")
@@ -431,24 +432,3 @@ def _method_name(settings: Mapping[str, Any]) -> str:
 def should_mesh(wanted: bool | None) -> bool:
     """Whether to extract a mesh: the option ``mesh``, or if it is None whether scikit-image is installed."""
     return importlib.util.find_spec("skimage") is not None if wanted is None else wanted
-
-
-def _check_settings(settings: Mapping[str, Any]) -> None:
-    """Raise an error for options that would otherwise fail only after minutes."""
-    if settings["dtype"] not in ("float32", "float64"):
-        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    pose_sources = ("auto", *recordings.POSE_SOURCES)
-    if settings["poses"] not in pose_sources:
-        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(pose_sources)}")
-    if settings["cutoff"] is not None and not settings["cutoff"] > 0:
-        raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
-    if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
-        raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
-    file_from_world(settings["axes"], (0.0, 1.0, 0.0))
-    DenseSweep.from_options(settings["dense"])
-    if settings["mesh"] and not should_mesh(None):
-        raise ImportError("mesh: found no scikit-image, expected it: pip install scikit-image")
-    integrate.extract_points(
-        integrate.make_volume(settings["voxel"] or 0.005, truncation=settings["truncation"]),
-        min_weight=settings["min_weight"],
-    )

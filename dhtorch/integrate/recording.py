@@ -271,7 +271,10 @@ def fuse_recording_grids(
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
-            view = view_from_recovered(answer, places.poses[answer.pair[0]], radius=1.5 * volume.voxel)
+            estimate, T = answer.estimate, places.poses[answer.pair[0]]
+            features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
+            points = estimate.uv, torch.where(answer.recovered, estimate.depth, 0.0), estimate.sigma, features
+            view = splat_points(answer.camera, answer.hw, *points, T_world_from_cam=T, radius=1.5 * volume.voxel)
             volume = fuse(volume, view, source=Source.RECOVERED)
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
@@ -330,23 +333,6 @@ def view_from_sensor(
         values = (uv[:, index], depth.flatten(1)[:, index], sigma.flatten(1)[:, index], features[:, index])
         return splat_points(camera, hw, *values, T_world_from_cam=T_world_from_cam, radius=radius)
     return DepthView(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
-
-
-def view_from_recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> DepthView:
-    """Depth view of a pair's recovered points, each a disc of ``radius`` metres."""
-    estimate = answer.estimate
-    depth = torch.where(answer.recovered, estimate.depth, 0.0)
-    features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
-    return splat_points(
-        answer.camera,
-        answer.hw,
-        estimate.uv,
-        depth,
-        estimate.sigma,
-        features,
-        T_world_from_cam=T_world_from_cam,
-        radius=radius,
-    )
 
 
 def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFrames) -> DepthView:

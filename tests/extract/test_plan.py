@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.stub_recordings import Load, P, frame, recording, rows
-from support.stub_samples import FixedEstimate, H, K, N, Stub, W, added, tiny
+from support.stub_samples import FixedEstimate, H, N, Stub, W
 
 from dhtorch import extract
 from dhtorch.extract import columns, plan
@@ -103,32 +103,6 @@ def test_a_row_looks_back_by_frame_number_inside_its_episode():
                 next(s for s in range(60) if torch.equal(frame(s).image, x.image)) for x in (other, reference)
             ]
     assert pairs == {(1, 2): [50, 52], (3, 2): [10, 12], (3, 7): [13, 15]}
-
-
-def test_a_row_states_where_it_belongs():
-    times = torch.tensor([0.5, 2.5], dtype=torch.float64)
-    made = rows([recording(numbers=[4, 9], times=times, name="x", episode=7)], 0)
-    assert len(made) == 2
-    assert made[1].place == {"episode_index": 7, "frame_index": 9, "timestamp": 2.5, "recording": "x"}
-    assert list(made[0].place) == list(columns.KEY_COLUMNS) and made[0].complaint == ""
-    assert np.isnan(rows([recording()], 0)[2].place["timestamp"])
-
-
-def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
-    one = recording(load=Load(confidence=True))
-    made = rows([one], 1, FixedEstimate(), seed=4)
-    answer = made[2]
-    before, now = frame(1, confidence=True), frame(2, confidence=True)
-    given = {"image": now.image[0], "before": before.image[0], "depth": now.depth[0], "conf": now.conf[0]}
-    given |= {"intrinsics": [K[0] + 2, *K[1:]], "K_before": [K[0] + 1, *K[1:]]}
-    options = {"depth_unit": "m", "confidence": "conf", "other_intrinsics": "K_before", "seed": 4}
-    wanted = added(tiny(**options)(given))
-    assert answer.features.keys() == wanted.keys()
-    for name, value in wanted.items():
-        assert np.array_equal(answer.features[name], value.numpy()), name
-        assert answer.features[name].dtype == columns.feature_columns(N, P)[name].kind
-    few = rows([one], 1, wanted=columns.select_columns(columns.feature_columns(N, P, half=True), ["depth"]))[2]
-    assert list(few.features) == ["depth", "problem"] and few.features["depth"].dtype == np.float16
 
 
 def test_a_method_is_given_what_the_frames_know():

@@ -19,7 +19,6 @@ from dhtorch.data import FormatError
 from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.extract.dataset import ExtractedRow
 from dhtorch.extract.plan import ShardSpec
-from dhtorch.transforms import TOKEN_CHANNELS
 
 N, P = 5, 6
 SHARED = {
@@ -118,19 +117,6 @@ def test_chosen_columns_keep_place_problem_and_order():
     assert blank.pop("problem") == 3 and not any(v.any() for v in blank.values())
 
 
-def test_a_table_names_units_and_has_fixed_lengths():
-    wanted = columns.feature_columns(N, P)
-    layout = columns.arrow_schema(wanted, {"a": "b"})
-    table = columns.arrow_table((row(k) for k in range(3)), wanted, layout)
-    assert table.num_rows == 3 and table.schema.metadata == {b"a": b"b"} and table.column_names == list(wanted)
-    for name, column in wanted.items():
-        field = table.schema.field(name)
-        assert field.metadata == {b"unit": column.unit.encode(), b"about": column.about.encode()} and not field.nullable
-    assert layout.field("uv").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), 2), N)
-    assert layout.field("tokens").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), len(TOKEN_CHANNELS)), P)
-    assert layout.field("recording").type == pyarrow.string() and layout.field("pose_ok").type == pyarrow.bool_()
-
-
 # ---------------------------------------------------------------------------------------------------- shards
 
 
@@ -144,6 +130,9 @@ def test_a_shard_says_what_it_holds(tmp_path):
     shared, own = shards.read_shard_metadata(path)
     assert shared == SHARED and own == {"number": 2, "of": 7, "counts": dict(counts)}
     metadata = parquet.read_metadata(path)
+    field = parquet.read_schema(path).field("uv")
+    assert field.metadata == {b"unit": b"px", b"about": wanted["uv"].about.encode()} and not field.nullable
+    assert field.type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), 2), N)
     assert metadata.num_rows == 4 and metadata.row_group(0).column(0).compression == "ZSTD"
     assert list(json.loads(metadata.metadata[b"dhtorch.shard"])["counts"]) == sorted(counts)
     assert json.loads(metadata.metadata[b"dhtorch"]) == SHARED

@@ -108,8 +108,3 @@ def test_the_files_of_an_answer_are_removed_when_the_page_has_them_and_after_an_
     page, *_ = next(answers)
     assert Path(page).read_text() == "scan.r3d" and next(answers, None) is None
     assert not list(tmp_path.iterdir())
-
-
-def test_the_page_is_built(app):
-    pytest.importorskip("gradio")
-    assert app.build_page() is not None

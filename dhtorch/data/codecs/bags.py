@@ -151,7 +151,12 @@ class _Records:
                 return
             try:
                 if record.kind == "chunk" and chunk is None:
-                    yield from self._iter_chunk(stream, record)
+                    compression, _, start, length = self.parse_chunk(stream, record)
+                    inner: tuple[BinaryIO, int, int, int] = stream, start, start + length, -1
+                    if compression:
+                        content = _read_chunk(self.file, read_version(self.file), record.begin)
+                        inner = io.BytesIO(content), 0, len(content), record.begin
+                    yield from self.iter_messages(*inner)
                 elif record.kind == "message":
                     yield self._parse_message(stream, record, -1 if chunk is None else chunk)
                 elif record.kind in ("schema", "channel"):
@@ -194,13 +199,6 @@ class _Records:
         if stream.tell() + length > record.start + record.length:
             raise FormatError(self.file, "chunk", f"{length} bytes in a record of {record.length}", "a whole chunk")
         return compression, size, stream.tell(), length
-
-    def _iter_chunk(self, stream: BinaryIO, record: _Record) -> Iterator[IndexedMessage]:
-        compression, _, start, length = self.parse_chunk(stream, record)
-        if compression:
-            content = _read_chunk(self.file, read_version(self.file), record.begin)
-            return self.iter_messages(io.BytesIO(content), 0, len(content), record.begin)
-        return self.iter_messages(stream, start, start + length, -1)
 
     def _parse_message(self, stream: BinaryIO, record: _Record, chunk: int) -> IndexedMessage:
         stream.seek(record.start)

@@ -84,8 +84,8 @@ def read_colmap_images(file: Path, *, observations: bool = True) -> list[ColmapI
         FormatError: a damaged file.
     """
     images = []
-    for image_id, pose, camera_id, name, seen in _binary_images(file) if file.suffix == ".bin" else _text_images(file):
-        table = seen(file) if observations else np.zeros((0, 3))
+    entries = _binary_images(file) if file.suffix == ".bin" else _text_images(file, observations)
+    for image_id, pose, camera_id, name, table in entries:
         qw, qx, qy, qz, *t = pose.values.tolist()
         w2c = convert.to_c2w(np.array([[qx, qy, qz, qw]]), np.array([t]), file, f"pose of {name}")[0]
         point = table[:, 2].astype(np.int64)
@@ -161,11 +161,11 @@ def _text_cameras(file: Path) -> Iterator[_Camera]:
         yield parse_id(words[0], file, line), model, (w, h), values[2:]
 
 
-#: Id, pose, camera, name and, on demand, observations (n, 3): u, v and the id of the point.
-_Image = tuple[int, ColmapNumbers, int, str, Any]
+#: Id, pose, camera, name and observations (n, 3): u, v and the id of the point.
+_Image = tuple[int, ColmapNumbers, int, str, np.ndarray]
 
 
-def _text_images(file: Path) -> Iterator[_Image]:
+def _text_images(file: Path, observations: bool) -> Iterator[_Image]:
     """Entries of ``images.txt``: two lines each, the second with observations, which may be empty."""
     lines, line, n = files.read_lines(file), 0, 0
     while line < len(lines):
@@ -178,20 +178,11 @@ def _text_images(file: Path) -> Iterator[_Image]:
         if len(words) != 10 or n >= 1_000_000:
             raise FormatError(file, f"line {line}", f"{len(words)} columns", "IMAGE_ID, QW … TZ, CAMERA_ID, NAME")
         pose = ColmapNumbers(line - 1, np.array(parse_numbers(words[1:8], 7, file, line)))
-        seen = _TextObservations(lines[line] if line < len(lines) else "", line + 1)
-        yield parse_id(words[0], file, line), pose, parse_id(words[8], file, line), words[9].strip(), seen
+        ids = [parse_id(word, file, line) for word in (words[0], words[8])]
+        seen = lines[line].split() if observations and line < len(lines) else []
+        table = np.array(parse_numbers(seen, len(seen) // 3 * 3, file, line + 1)).reshape(-1, 3)
+        yield ids[0], pose, ids[1], words[9].strip(), table
         line, n = line + 1, n + 1
-
-
-class _TextObservations(NamedTuple):
-    """The second line of an image, which is parsed on demand."""
-
-    text: str
-    line: int
-
-    def __call__(self, file: Path) -> np.ndarray:
-        words = self.text.split()
-        return np.array(parse_numbers(words, len(words) // 3 * 3, file, self.line)).reshape(-1, 3)
 
 
 def _text_points(file: Path) -> Iterator[tuple[int, ColmapNumbers]]:
@@ -258,8 +249,7 @@ def _binary_images(file: Path) -> Iterator[_Image]:
         (camera_id,) = cursor.take("I")
         name = cursor.text()
         seen = cursor.array(observation, cursor.take("Q")[0])
-        table = np.column_stack([seen["uv"], seen["point"]])
-        yield image_id, pose, camera_id, name, lambda _, table=table: table
+        yield image_id, pose, camera_id, name, np.column_stack([seen["uv"], seen["point"]])
 
 
 def _binary_points(file: Path) -> Iterator[tuple[int, ColmapNumbers]]:

@@ -162,11 +162,11 @@ def mask_crc(crc: int) -> int:
 
 def crc32c(data: bytes) -> int:
     """CRC-32C of ``data``: checksums of many blocks in parallel, then combined, since the CRC is linear in its bits."""
-    state, table = 0xFFFFFFFF, _crc_table()
+    state = 0xFFFFFFFF
+    table, (a, b, c, d) = _crc_tables()
     head = len(data) % _CRC_BLOCK_BYTES
     for byte in data[:head]:
         state = int(table[(state ^ byte) & 0xFF]) ^ (state >> 8)
-    shifts = [t.tolist() for t in _crc_shift_table()]
     for at in range(head, len(data), _CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES):
         batch = np.frombuffer(
             data, np.uint8, min(_CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES, len(data) - at), at
@@ -176,27 +176,20 @@ def crc32c(data: bytes) -> int:
         for column in columns:
             sums = table[(sums ^ column) & 0xFF] ^ (sums >> 8)
         for block in sums.tolist():
-            a, b, c, d = shifts
             state = a[state & 0xFF] ^ b[(state >> 8) & 0xFF] ^ c[(state >> 16) & 0xFF] ^ d[state >> 24] ^ block
     return state ^ 0xFFFFFFFF
 
 
 @cache
-def _crc_table() -> np.ndarray:
-    """Table (256,) of the state's change by one byte."""
-    state = np.arange(256, dtype=np.uint32)
+def _crc_tables() -> tuple[np.ndarray, list[list[int]]]:
+    """(256,) change of the state by one byte, and (4, 256) by a block of zeros for each byte of the state."""
+    table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
-        state = np.where(state & 1, (state >> 1) ^ np.uint32(_CRC_POLYNOMIAL), state >> 1)
-    return state
-
-
-@cache
-def _crc_shift_table() -> np.ndarray:
-    """Table (4, 256) of the state's change by a block of zeros, for each byte of the state."""
-    state = (np.arange(256, dtype=np.uint32)[None] << (8 * np.arange(4, dtype=np.uint32))[:, None]).astype(np.uint32)
+        table = np.where(table & 1, (table >> 1) ^ np.uint32(_CRC_POLYNOMIAL), table >> 1)
+    shifts = (np.arange(256, dtype=np.uint32)[None] << (8 * np.arange(4, dtype=np.uint32))[:, None]).astype(np.uint32)
     for _ in range(_CRC_BLOCK_BYTES):
-        state = _crc_table()[state & 0xFF] ^ (state >> 8)
-    return state
+        shifts = table[shifts & 0xFF] ^ (shifts >> 8)
+    return table, shifts.tolist()
 
 
 class _Message:
@@ -214,18 +207,17 @@ class _Message:
                 name, feature = "", None
                 for number, span in self._inner(entry, 1, 2):
                     if number == 1:
-                        name = self._text(span)
-                    else:
-                        feature = self._feature(span)
+                        try:
+                            name = self.body[span[0] : sum(span)].decode()
+                        except UnicodeDecodeError as error:
+                            raise FormatError(self.file, "name of a feature", error.reason, "UTF-8") from None
+                        continue
+                    kind, inner = next(self._inner(span, *_FEATURE_KINDS), (0, span))
+                    spans = (ByteSpan(self.start + at, size) for n, _, (at, size) in self._fields(inner) if n == 1)
+                    feature = ExampleFeature(_FEATURE_KINDS[kind], tuple(spans)) if kind else None
                 if feature is not None:
                     result[name] = feature
         return result
-
-    def _feature(self, within: tuple[int, int]) -> ExampleFeature | None:
-        for number, inner in self._inner(within, *_FEATURE_KINDS):
-            spans = (ByteSpan(self.start + at, size) for field, _, (at, size) in self._fields(inner) if field == 1)
-            return ExampleFeature(_FEATURE_KINDS[number], tuple(spans))
-        return None
 
     def _inner(self, within: tuple[int, int], *numbers: int) -> Iterator[tuple[int, tuple[int, int]]]:
         """Length-delimited fields (bytes, strings, messages) with one of ``numbers``: (field number, span)."""
@@ -263,12 +255,6 @@ class _Message:
             if byte < 0x80:
                 return value, at
         raise FormatError(self.file, "message", f"an unterminated number at byte {at}", "a tf.train.Example")
-
-    def _text(self, span: tuple[int, int]) -> str:
-        try:
-            return self.body[span[0] : span[0] + span[1]].decode()
-        except UnicodeDecodeError as error:
-            raise FormatError(self.file, "name of a feature", error.reason, "UTF-8") from None
 
 
 def _decode_varints(run: bytes, file: Path, name: str) -> np.ndarray:
