@@ -81,7 +81,10 @@ class _GltfBuilder:
         if not finite.any():
             return
         rgb = np.full((n, 3), 0.6) if shape.rgb is None else check_rows("write_glb", "rgb", shape.rgb, n, 3)
-        attributes = {"POSITION": self._floats(points[finite], bounds=True), "COLOR_0": self._colours(rgb[finite])}
+        # sRGB → linear colours as floats: 8 bits are too coarse for dark colours, and some readers fail on 16.
+        display = colour_to_uint8(rgb[finite]) / 255.0
+        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        attributes = {"POSITION": self._floats(points[finite], bounds=True), "COLOR_0": self._floats(linear)}
         if shape.normal is not None:
             normal = check_rows("write_glb", "normal", shape.normal, n, 3)[finite].astype(np.float64)
             length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -117,11 +120,6 @@ class _GltfBuilder:
     def _floats(self, values: np.ndarray, bounds: bool = False) -> int:
         kind = "VEC3" if values.ndim == 2 else "SCALAR"
         return self._accessor(np.ascontiguousarray(values, "<f4"), _FLOAT, kind, bounds=bounds)
-
-    def _colours(self, rgb: np.ndarray) -> int:
-        """sRGB → linear colours as floats: 8 bits are too coarse for dark colours, and some readers fail on 16."""
-        display = colour_to_uint8(rgb) / 255.0
-        return self._floats(np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4))
 
     def _accessor(
         self,

@@ -210,9 +210,20 @@ def make_arrow_schema(
 
     cell = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
     fields = []
+    columns: dict[str, Any] = {}  # by which the library ``datasets`` recognises image and array columns
     for key, feature in features.items():
         if feature["dtype"] == "video":
             continue
+        dtype, shape = feature["dtype"], list(feature["shape"])
+        value = {"dtype": dtype, "_type": "Value"}
+        if dtype == "image":
+            columns[key] = {"_type": "Image"}
+        elif shape in ([], [1]):
+            columns[key] = value
+        elif len(shape) == 1:
+            columns[key] = {"feature": value, "length": shape[0], "_type": "Sequence"}
+        else:
+            columns[key] = {"shape": shape, "dtype": dtype, "_type": f"Array{len(shape)}D"}
         kind = types.get(key)
         if kind is None and feature["dtype"] == "image":
             kind = cell
@@ -224,7 +235,8 @@ def make_arrow_schema(
             elif list(feature["shape"]) != [1]:
                 kind = pyarrow.list_(kind, feature["shape"][0])
         fields.append(pyarrow.field(key, kind))
-    return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface_metadata(features)})
+    huggingface = json.dumps({"info": {"features": columns}}).encode()
+    return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": huggingface})
 
 
 def nested_lists(values: np.ndarray) -> Any:
@@ -236,23 +248,6 @@ def nested_lists(values: np.ndarray) -> Any:
         offsets = np.arange(int(np.prod(values.shape[:axis])) + 1, dtype=np.int64) * values.shape[axis]
         column = pyarrow.ListArray.from_arrays(pyarrow.array(offsets.astype(np.int32)), column)
     return column
-
-
-def _huggingface_metadata(features: Mapping[str, FeatureSpec]) -> bytes:
-    """Schema metadata by which the library ``datasets`` recognises image and array columns."""
-    columns: dict[str, Any] = {}
-    for key, feature in features.items():
-        kind, shape = feature["dtype"], list(feature["shape"])
-        value = {"dtype": kind, "_type": "Value"}
-        if kind == "image":
-            columns[key] = {"_type": "Image"}
-        elif kind != "video" and shape in ([], [1]):
-            columns[key] = value
-        elif kind != "video" and len(shape) == 1:
-            columns[key] = {"feature": value, "length": shape[0], "_type": "Sequence"}
-        elif kind != "video":
-            columns[key] = {"shape": shape, "dtype": kind, "_type": f"Array{len(shape)}D"}
-    return json.dumps({"info": {"features": columns}}).encode()
 
 
 # ----------------------------------------------------------------------------------------------------------- places

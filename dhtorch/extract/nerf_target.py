@@ -66,12 +66,24 @@ class NerfstudioTarget:
             for row in iter_rows(parts[key]):
                 tally.add(row)
                 if row["depth"] and np.isfinite(row["pose"]).all():
-                    shots.append(_write_shot(folder, row, view, cloud))
+                    stem = f"frame_{row['frame_index']:06d}"
+                    depth, sigma = (decode_tiff(row[name], folder / stem, view.map_hw) for name in ("depth", "sigma"))
+                    cloud.add(depth, sigma, row, view, folder)
+                    steps = nerfstudio.quantise_nerfstudio_depth(depth)
+                    confidence = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
+                    pictures = {"images": row["picture"], "depth": encode_png(steps), "source": row["source"]}
+                    for name, content in {**pictures, "confidence": encode_png(confidence)}.items():
+                        storage.replace_file(folder / name / f"{stem}.png", content)
+                    K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
+                    shot = nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens, row["timestamp"])
+                    shots.append(shot | {f"dhtorch_{name}": np.asarray(row[name]).tolist() for name in NUMBER_COLUMNS})
             if not shots:
                 raise ValueError(f"{folder.name}: found no frame with a pose, expected poses (format=nerfstudio)")
             cameras = {view.name: tally.summary()}
             summary = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
-            cloud.write(folder / _POINTS_FILE)
+            points = np.concatenate(cloud.parts)
+            comment = "metres; world of transforms.json"
+            write_ply(folder / _POINTS_FILE, points[:, :3], points[:, 3:].astype(np.uint8), comments=(comment,))
             contents = {
                 "camera_model": "OPENCV",
                 "depth_unit_scale_factor": nerfstudio.DEPTH_UNIT_M,
@@ -120,23 +132,3 @@ class _PointCloud:
         self.parts.append(np.concatenate((xyz, rgb), 1).astype(np.float32))
         if sum(map(len, self.parts)) > 2 * 200_000:
             self.parts, self.stride = [part[::2] for part in self.parts], 2 * self.stride
-
-    def write(self, path: Path) -> None:
-        """Write the points as PLY."""
-        points = np.concatenate(self.parts)
-        write_ply(path, points[:, :3], points[:, 3:].astype(np.uint8), comments=("metres; world of transforms.json",))
-
-
-def _write_shot(folder: Path, row: Row, view: DatasetCamera, cloud: _PointCloud) -> Row:
-    stem = f"frame_{row['frame_index']:06d}"
-    depth, sigma = (decode_tiff(row[kind], folder / stem, view.map_hw) for kind in ("depth", "sigma"))
-    cloud.add(depth, sigma, row, view, folder)
-    steps = nerfstudio.quantise_nerfstudio_depth(depth)
-    confidence = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
-    pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(confidence)}
-    pictures["source"] = row["source"]
-    for name, content in pictures.items():
-        storage.replace_file(folder / name / f"{stem}.png", content)
-    K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
-    numbers = {f"dhtorch_{key}": np.asarray(row[key]).tolist() for key in NUMBER_COLUMNS}
-    return {**nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens, row["timestamp"]), **numbers}

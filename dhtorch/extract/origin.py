@@ -124,7 +124,26 @@ class LeRobotSource(DatasetSource):
             meta = read_lerobot_meta(root)
             info = files.read_json(root / "meta" / "info.json")
             episodes = read_lerobot_episodes(meta, numbers)
-            tasks = tuple(_read_tasks(meta))
+            lines, table = root / "meta" / "tasks.jsonl", root / "meta" / "tasks.parquet"
+            named: dict[int, str] = {}  # texts by task_index
+            if lines.is_file():
+                for text in files.read_text(lines).splitlines():
+                    row = files.decode_json(text, lines) if text.strip() else None
+                    if row is not None:
+                        task = files.get_entry(row, "task", str, lines)
+                        named[files.get_entry(row, "task_index", int, lines)] = task
+            elif table.is_file():
+                names = [name for name in read_parquet_header(table).columns if name != "task_index"]
+                name = "task" if "task" in names else names[-1] if names else "task"
+                content = read_columns(table, ["task_index", name])
+                indices = np.asarray(content["task_index"])
+                if indices.dtype.kind not in "iu":
+                    raise FormatError(table, "task_index", f"{indices.dtype} {indices[:1].tolist()}", "whole numbers")
+                named = dict(zip(indices.tolist(), map(str, content[name]), strict=True))
+            if any(not 0 <= k < _MAX_TASKS for k in named):
+                file = lines if lines.is_file() else table
+                raise FormatError(file, "task_index", min(named), f"0 to {_MAX_TASKS - 1}")
+            tasks = tuple(named.get(k, "") for k in range(max(named, default=0) + 1))  # missing ones are empty
         return cls(
             meta=meta,
             info=info,
@@ -258,28 +277,6 @@ class LeRobotSource(DatasetSource):
         files = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
         kept = (p for p in sorted(files) if p.is_file() and p.name not in _REWRITTEN_META_FILES and self._is_inside(p))
         return {str(p.relative_to(root)): p for p in kept}
-
-
-def _read_tasks(meta: LeRobotMeta) -> list[str]:
-    """Metadata -> task texts by ``task_index``; missing ones are empty."""
-    lines, table = meta.root / "meta" / "tasks.jsonl", meta.root / "meta" / "tasks.parquet"
-    tasks: dict[int, str] = {}
-    if lines.is_file():
-        for text in files.read_text(lines).splitlines():
-            row = files.decode_json(text, lines) if text.strip() else None
-            if row is not None:
-                tasks[files.get_entry(row, "task_index", int, lines)] = files.get_entry(row, "task", str, lines)
-    elif table.is_file():
-        names = [name for name in read_parquet_header(table).columns if name != "task_index"]
-        name = "task" if "task" in names else names[-1] if names else "task"
-        content = read_columns(table, ["task_index", name])
-        numbers = np.asarray(content["task_index"])
-        if numbers.dtype.kind not in "iu":
-            raise FormatError(table, "task_index", f"{numbers.dtype} {numbers[:1].tolist()}", "whole numbers")
-        tasks = dict(zip(numbers.tolist(), map(str, content[name]), strict=True))
-    if any(not 0 <= k < _MAX_TASKS for k in tasks):
-        raise FormatError(lines if lines.is_file() else table, "task_index", min(tasks), f"0 to {_MAX_TASKS - 1}")
-    return [tasks.get(k, "") for k in range(max(tasks, default=0) + 1)]
 
 
 def has_frame_rate(recording: Recording) -> bool:

@@ -7,7 +7,7 @@ files, without a feature.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +17,13 @@ from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_meta import LeRobotFeature
-from dhtorch.export import lerobot
-from dhtorch.export.lerobot import FeatureMoments, FeatureSpec
+from dhtorch.export.lerobot import FeatureSpec
 
 
 def find_one_channel(features: Mapping[str, FeatureSpec], kind: str, cameras: Container[str]) -> list[str]:
     """Keys of the features of ``kind`` (image, video) with one channel that are none of the ``cameras``."""
     keys = (key for key, feature in features.items() if feature["dtype"] == kind and key not in cameras)
     return [key for key in keys if _parse(key, features[key]).channels == 1]
-
-
-def read_pixel_feature(key: str, feature: FeatureSpec, cell: Any, root: Path | None) -> FeatureSpec:
-    """Feature of an image column and one of its cells -> feature of the same numbers as an array."""
-    pixels = decode_cell(key, feature, cell, root)
-    return lerobot.map_feature(_parse(key, feature).hw, str(pixels.dtype), **dict(feature.get("info") or {}))
-
-
-def decode_cells(key: str, feature: FeatureSpec, cells: Iterable[Any], root: Path | None, kind: str) -> Any:
-    """Cells of an image column -> Arrow column of arrays (1, h, w) of dtype ``kind``.
-
-    Raises:
-        FormatError: a cell without an image, or with one of another type or size.
-    """
-    pictures = [decode_cell(key, feature, cell, root) for cell in cells]
-    for picture in pictures:
-        if str(picture.dtype) != kind:
-            raise FormatError(root or Path(), key, picture.dtype, f"{kind}, as in the first row")
-    return lerobot.nested_lists(np.stack(pictures)[:, None])
 
 
 def decode_cell(key: str, feature: FeatureSpec, cell: Any, root: Path | None) -> np.ndarray:
@@ -72,13 +52,6 @@ def decode_cell(key: str, feature: FeatureSpec, cell: Any, root: Path | None) ->
         return files.decode_depth_png(data, place, 1.0, hw).astype(np.uint16)
     pixels = files.decode_image(data, place, hw)
     return pixels[0] if len(pixels) == 1 else pixels
-
-
-def colour_moments(key: str, feature: FeatureSpec, cell: Any, root: Path | None) -> FeatureMoments:
-    """Moments of the channels of a colour image of 8 bits, in [0, 1]."""
-    pixels = decode_cell(key, feature, cell, root)
-    channels = _parse(key, feature).channels
-    return FeatureMoments.of(np.broadcast_to(pixels, (channels, *pixels.shape[-2:])).reshape(channels, -1).T / 255)
 
 
 def count_channels(key: str, feature: FeatureSpec) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import names
-from dhtorch.data.io.decode import import_optional
+from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
 from dhtorch.export.video import open_lossless_video
@@ -94,13 +94,14 @@ class LeRobotTarget:
         self.pixels: dict[str, FeatureSpec] = {}
         if origin is not None and not as_images:
             one_channel = pixel_columns.find_one_channel(self.source_features, "image", views)
-            first = next(iter(origin.batches(0, []))) if one_channel else None
+            first: Any = next(iter(origin.batches(0, []))) if one_channel else None
             with doors.restrict_links(origin.bounds):
                 for name in one_channel:
                     cell = first.column(name)[0].as_py()
-                    self.pixels[name] = pixel_columns.read_pixel_feature(
-                        name, self.source_features[name], cell, origin.root
-                    )
+                    feature = self.source_features[name]
+                    pixels = pixel_columns.decode_cell(name, feature, cell, origin.root)
+                    info = dict(feature.get("info") or {})
+                    self.pixels[name] = lerobot.map_feature(pixels.shape, str(pixels.dtype), **info)
         self.keys = {view.key: self._keys(view) for view in views.values()}
         #: Camera -> feature of its geometry images.
         self.geometry = {view: keys["geometry_image"] for view, keys in self.keys.items() if "geometry_image" in keys}
@@ -255,10 +256,15 @@ class LeRobotTarget:
         for part in self.origin.batches(k, tasks):
             table, n = part, part.num_rows
             for key, feature in self.pixels.items():  # images of one channel become numbers
+                root, spec = self.origin.root, self.source_features[key]
                 cells = table.column(key).to_pylist()
-                pixels = pixel_columns.decode_cells(
-                    key, self.source_features[key], cells, self.origin.root, feature["dtype"]
-                )
+                pictures = [pixel_columns.decode_cell(key, spec, cell, root) for cell in cells]
+                for picture in pictures:
+                    if str(picture.dtype) != feature["dtype"]:
+                        raise FormatError(
+                            root or Path(), key, picture.dtype, f"{feature['dtype']}, as in the first row"
+                        )
+                pixels = lerobot.nested_lists(np.stack(pictures)[:, None])
                 table = table.set_column(table.column_names.index(key), key, pixels)
             numbers = part.column("frame_index").to_pylist()
             times = (
@@ -552,7 +558,9 @@ class LeRobotTarget:
                 if feature is None or name in self.views or pixel_columns.count_channels(name, feature) != 3:
                     continue
                 root = None if self.origin is None else self.origin.root
-                here = pixel_columns.colour_moments(name, feature, table.column(name)[0].as_py(), root)
+                pixels = pixel_columns.decode_cell(name, feature, table.column(name)[0].as_py(), root)
+                colours = np.broadcast_to(pixels, (3, *pixels.shape[-2:])).reshape(3, -1).T
+                here = FeatureMoments.of(colours / 255)
             elif kind.count("list<") > 1:
                 continue  # maps, whose moments are those of their pixels
             else:

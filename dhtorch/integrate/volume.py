@@ -132,7 +132,14 @@ def fuse_views(
     confidence: paper, "Global integration (scope note)".
     """
     _check_view(volume, view)
-    channel = _find_channels(source, view.depth)
+    # Index in ``VOLUME_SOURCES`` (B, h, w) of the source of each pixel; 0 where there is no depth.
+    codes = torch.as_tensor(source, device=view.depth.device)
+    if codes.ndim:
+        check("fuse_views", source=(codes, "B h w"), depth=(view.depth, "B h w"))
+    known = codes.expand_as(view.depth)[..., None] == torch.tensor(VOLUME_SOURCES, device=codes.device)
+    if bool((~known.any(-1) & (view.depth > 0)).any()):
+        raise ValueError(f"fuse_views: source is {source}, expected one of {VOLUME_SOURCES}")
+    channel = known.int().argmax(-1)
     if weight not in WEIGHTINGS:
         raise ValueError(f"weight: found {weight!r}, expected {' or '.join(WEIGHTINGS)}")
     with torch.no_grad():
@@ -219,9 +226,14 @@ def splat_points(
         covered &= (position >= 0).all(-1) & (position[..., 0] < w) & (position[..., 1] < h)
         b, n, o = covered.nonzero(as_tuple=True)
         pixel = (b * h + position[b, n, o, 1]) * w + position[b, n, o, 0]
-        owner = _nearest_owner(pixel, z[b, n], n, B * h * w)
-        has_owner = (owner >= 0).view(B, h, w)
-        index = owner.clamp_min(0).view(B, h * w)
+        # For each pixel the point of the nearest depth, the first of equal ones.
+        near = torch.full((B * h * w,), torch.inf, dtype=z.dtype, device=z.device)
+        near = near.scatter_reduce(0, pixel, z[b, n], "amin")
+        is_nearest = z[b, n] == near[pixel]
+        owner = torch.full(near.shape, torch.iinfo(torch.int64).max, device=z.device)
+        owner = owner.scatter_reduce(0, pixel[is_nearest], n[is_nearest], "amin")
+        has_owner = near.isfinite().view(B, h, w)
+        index = torch.where(near.isfinite(), owner, 0).view(B, h * w)
 
         def spread(values: Tensor) -> Tensor:
             flat = values.gather(1, index[..., None].expand(-1, -1, values.shape[-1])) if values.shape[1] else None
@@ -331,21 +343,6 @@ class _ViewIntegrator:
         return pixel, torch.where(in_field & (depth > 0), along, -torch.inf)
 
 
-def _find_channels(source: int | Tensor, depth: Tensor) -> Tensor:
-    """Index in ``VOLUME_SOURCES`` (B, h, w) of the source of each pixel; 0 where there is no depth (B, h, w).
-
-    Raises:
-        ValueError: another source of a pixel with depth, or another shape.
-    """
-    codes = torch.as_tensor(source, device=depth.device)
-    if codes.ndim:
-        check("fuse_views", source=(codes, "B h w"), depth=(depth, "B h w"))
-    matches = codes.expand_as(depth)[..., None] == torch.tensor(VOLUME_SOURCES, device=depth.device)
-    if bool((~matches.any(-1) & (depth > 0)).any()):
-        raise ValueError(f"fuse_views: source is {source}, expected one of {VOLUME_SOURCES}")
-    return matches.int().argmax(-1)
-
-
 def _grow(volume: Volume, keys: list[Tensor], copy: bool = True) -> Volume:
     """A copy of the volume with the blocks of ``keys`` added, empty; without ``copy``, itself if no block is new."""
     key = torch.cat((volume.key, *keys)).unique()
@@ -358,16 +355,6 @@ def _grow(volume: Volume, keys: list[Tensor], copy: bool = True) -> Volume:
 
     fields = ("distance", "weight", "n_swept", "features")
     return volume.replace(key=key, **{name: zero_padded(getattr(volume, name)) for name in fields})
-
-
-def _nearest_owner(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
-    """For each pixel the owner of the nearest depth, the first of equal ones; -1 where there is none."""
-    nearest = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
-    nearest = nearest.scatter_reduce(0, pixel, depth, "amin")
-    first = torch.full((n_pixels,), torch.iinfo(torch.int64).max, device=pixel.device)
-    is_nearest = depth == nearest[pixel]
-    first = first.scatter_reduce(0, pixel[is_nearest], owner[is_nearest], "amin")
-    return torch.where(nearest.isfinite(), first, -1)
 
 
 def _check_view(volume: Volume, view: DepthView) -> None:

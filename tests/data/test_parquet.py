@@ -39,13 +39,6 @@ def test_statistics_that_do_not_fit_the_schema_do_not_end_the_process(tmp_path):
         parquet.read_columns(file, ["x"])
 
 
-def test_a_file_that_changed_is_read_again(tmp_path):
-    file = tmp_path / "x.parquet"
-    for n in (3, 5):
-        arrow.write_table(pyarrow.table({"x": list(range(n))}), file)
-        assert parquet.read_columns(file, ["x"])["x"].tolist() == list(range(n))
-
-
 def test_cells_and_columns_that_are_not_there(tmp_path):
     file = tmp_path / "x.parquet"
     arrow.write_table(table(), file, row_group_size=50)
@@ -66,23 +59,3 @@ def test_cells_and_columns_that_are_not_there(tmp_path):
     ):
         with pytest.raises(FormatError, match=named):
             call()
-
-
-@pytest.mark.parametrize(
-    "damaged", [b"", b"\x15", b"\x19\xfc\xff\xff\xff\xff\x07", b"\x1c" * 40, b"\x15\x02\x00", b"\x1b\x00\x00"]
-)
-def test_damaged_structures_raise(damaged):
-    with pytest.raises((ValueError, IndexError)):
-        list(parquet._Thrift(damaged).iter_structs(4))
-
-
-@pytest.mark.parametrize(
-    ("said", "values"),
-    [
-        ([0x13, 100, 0x17, *8 * [9], 0x13, 7, 0], {1: 100, 2: 8 * b"\t", 3: 7}),
-        ([0x15, 4, 0x18, 2, 104, 105, 0x19, 0x25, 1, 4, 0x11, 0x1C, 0x15, 5, 0, 0], {1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}),
-    ],
-)  # fmt: skip
-def test_a_structure_in_thrift(said, values):
-    data = parquet._Thrift(bytes(said))
-    assert (data.struct(), data.at) == (values, len(said))

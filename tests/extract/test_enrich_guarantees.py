@@ -39,7 +39,6 @@ from dhtorch.extract.origin import DEFAULT_FPS, LeRobotSource, frame_rate
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.targets import MapCounts, PeekableRows
 from dhtorch.pipeline.presets import PAPER
-from dhtorch.runtime.output_folder import acquire_file_lock
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.two_cameras import open_two_cameras
 
@@ -216,12 +215,6 @@ def test_a_nerfstudio_folder_holds_frames_with_a_pose_and_is_sure_of_its_own_dep
     held = (in_metres[0] > 0) & (in_metres[0] < 65.5)
     assert 0 < held.sum() < (in_metres[0] > 0).sum()
     assert np.array_equal(depth > 0, held) and np.array_equal(sure > 0, held)
-
-
-def test_two_writers_do_not_share_a_folder(robot, tmp_path, capsys):
-    with acquire_file_lock(tmp_path / "set" / ".dhtorch" / "lock", "out"):
-        assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED]) == 2
-    assert "one writer" in capsys.readouterr().err and not list((tmp_path / "set").rglob("*.json"))
 
 
 @pytest.mark.slow

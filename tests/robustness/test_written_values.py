@@ -6,7 +6,6 @@ Pillow, json and struct, never with dhtorch's own readers.
 
 from __future__ import annotations
 
-import base64
 import io
 import itertools
 import json
@@ -33,8 +32,6 @@ from dhtorch import data
 from dhtorch.cli.run import main
 from dhtorch.codes import Gate, Hole, Source
 from dhtorch.extract.step_set import RldsSource
-from dhtorch.viz.viewer import html
-from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud, SweptPointCloud
 
 KEYS = [f"observation.images.{name}" for name in CAMERAS]
 FEW = ["method=paper", "method.n=64", "method.hypotheses=10"]
@@ -73,11 +70,6 @@ def read_json(*parts: Path | str) -> Any:
 
 def read_lines(file: Path) -> list[Any]:
     return [json.loads(line) for line in file.read_text().splitlines()]
-
-
-def video(file: Path) -> Array:
-    with av.open(str(file)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def hold(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -159,7 +151,8 @@ def test_the_metadata_lead_to_the_rows_and_video_frames_of_every_episode(robot: 
                 where |= {name: episodes[e][f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
                 first, last = (episodes[e][f"videos/{key}/{end}_timestamp"] * FPS for end in ("from", "to"))
                 assert last - first == pytest.approx(n)
-            frames = video(root / info["video_path"].format(**where))[round(first) :]
+            with av.open(str(root / info["video_path"].format(**where))) as container:
+                frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)][round(first) :]
             for i in range(n):
                 assert np.array_equal(frames[i], known.picture(camera, e, i)), (key, e, i)
 
@@ -455,74 +448,3 @@ def check_tokens(row: dict[str, Any], u: Array, v: Array, valid: Array) -> None:
             want[2] = valid[inside].mean()
             want[3:] = np.bincount(hole[inside], minlength=len(want) - 3) / inside.sum()
         same(token, want, 1e-5)
-
-
-# -------------------------------------------------------------------------------------------------------- viewer
-
-
-def test_the_viewers_page_holds_both_cameras_and_every_sample(tmp_path: Path) -> None:
-    draw, n = np.random.default_rng(2), 12
-    columns: dict[str, Array] = {name: draw.random(n, np.float32) for name in ("depth", "sigma", "parallax_deg")}
-    columns |= {name: draw.random(n, np.float32) for name in ("residual_px", "error", "score")}
-    columns |= {"uv_0": draw.uniform(0, 40, (n, 2)), "uv_1": draw.uniform(-9, 40, (n, 2))}
-    columns |= {"xyz": draw.random((n, 3), np.float32), "rgb": draw.integers(0, 256, (n, 3)).astype(np.uint8)}
-    codes = ("tracked", "source", "gate", "hole", "candidate", "cause")
-    columns |= {name: draw.integers(0, 2, n).astype(np.uint8) for name in codes}
-    clouds = [
-        PointCloud(draw.uniform(-2, 1, (n, 3)).astype(np.float32), draw.integers(0, 256, (n, 3)).astype(np.uint8))
-        for _ in "ab"
-    ]
-    swept = SweptPointCloud(
-        clouds[0].xyz + 5,
-        clouds[1].rgb,
-        columns["sigma"] + 1,
-        columns["score"],
-        3 + 2 * columns["tracked"],
-        2.0,
-        columns["cause"],
-    )
-    shot = PairExhibit(
-        "a pair",
-        columns,
-        known.pose(0, 0, 1),
-        known.pose(1, 1, 3),
-        0,
-        1,
-        clouds[0],
-        clouds[1],
-        swept,
-        None,
-        {"n": "12"},
-    )
-    views = [
-        ExhibitView(10 + c, known.time(c, c, 3), bytes([c, 7]), HW, (480 + c, 640), (60.0 + c, 61.0), (31.5, 23.5 + c))
-        for c in range(2)
-    ]
-    path = np.stack([known.pose(0, 0, i)[:3, 3] for i in range(5)])
-    file = html.write_viewer_page(tmp_path / "a.html", Exhibit("known", [shot], views, path, {"k": "v"}))
-    data = json.loads(file.read_text().partition('type="application/json" id="data">')[2].partition("</script>")[0])
-    for k, (view, sent) in enumerate(zip(views, data["views"], strict=True)):
-        hold(sent, {"number": 10 + k, "time": view.time, "hw": list(view.hw), "f": list(view.f), "c": list(view.c)})
-        assert base64.b64decode(sent["jpeg"]) == view.jpeg
-    (sent,) = data["shots"]
-    own = {"label": "a pair", "view_0": 0, "view_1": 1, "T_world_from_0": known.pose(0, 0, 1)[:3]}
-    hold(sent, own | {"T_world_from_1": known.pose(1, 1, 3)[:3]})
-    same(unpack(data["path"]), path.ravel(), 1e-7)
-    for name, values in columns.items():
-        packed = unpack(sent["samples"][name])
-        if name in ("uv_0", "uv_1"):
-            same(packed / data["per_pixel"] - data["margin_px"], values.ravel(), 0.5 / data["per_pixel"] + 1e-6)
-        else:
-            same(packed / 65535 if name == "score" else packed, values.ravel(), 1e-5 if name == "score" else 0)
-    for name, cloud in (("seen", clouds[0]), ("held_out", clouds[1]), ("swept", swept)):
-        half_step = 0.501 * np.ptp(cloud.xyz, 0).max() / 65535  # 16 bits between the least and the largest coordinate
-        same(unpack(sent[name]["xyz"]).reshape(-1, 3) * sent[name]["step"] + sent[name]["low"], cloud.xyz, half_step)
-        same(unpack(sent[name]["rgb"]), cloud.rgb.ravel())
-    numbers = {name: unpack(sent["swept"][name]) for name in ("sigma", "score", "cause", "source")}
-    own = {"sigma": swept.sigma, "score": (65535 * swept.score, 0.65), "cause": columns["cause"]}
-    hold(numbers, own | {"source": 3 + 2 * columns["tracked"]})
-    assert sent["swept"]["step_px"] == 2.0
-
-
-def unpack(packed: dict[str, str]) -> Array:
-    return np.frombuffer(base64.b64decode(packed["base64"]), f"<{packed['type']}").astype(np.float64)

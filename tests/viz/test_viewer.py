@@ -619,6 +619,8 @@ def test_a_page_places_each_camera_where_it_stood(exhibit):
     for name in ("seen", "held_out", "swept"):
         xyz = unpacked(shot[name]["xyz"]).reshape(-1, 3) * shot[name]["step"] + shot[name]["low"]
         assert np.allclose(xyz, getattr(exhibit.shots[0], name).xyz, atol=1e-3)
+        assert np.array_equal(unpacked(shot[name]["rgb"]), getattr(exhibit.shots[0], name).rgb.ravel())
+    assert unpacked(data["path"]).tolist() == [0, 1, 2, 3, 4, 5]
     assert np.allclose(unpacked(shot["samples"]["score"]) / 65535, [0, 0.25, 0.5, 1], atol=1e-4)
     assert np.allclose(unpacked(shot["swept"]["score"]) / 65535, [0.2, 0.9], atol=1e-4)
     assert unpacked(shot["swept"]["source"]).tolist() == [Source.SWEPT, Source.FILLED]

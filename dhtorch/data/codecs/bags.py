@@ -90,7 +90,20 @@ def iter_messages(file: Path) -> Iterator[IndexedMessage]:
     """
     signature = read_signature(file)
     if signature == _SQLITE:
-        yield from _iter_rows(file)
+        with _open_database(file) as database:
+            query = "SELECT id, name, type, serialization_format FROM topics LIMIT ?"
+            rows = database.execute(query, (_MAX_TOPICS + 1,)).fetchall()
+            if len(rows) > _MAX_TOPICS:
+                raise FormatError(file, "topics", f"more than {_MAX_TOPICS}", "fewer")
+            if not all(isinstance(word, str) for row in rows for word in row[1:]):
+                raise FormatError(file, "topics", "a name that is no text", "texts")
+            topics = {number: _make_topic(*words) for number, *words in rows}
+            columns = "id, topic_id, timestamp, length(data), substr(data, 1, ?)"
+            for row in database.execute(f"SELECT {columns} FROM messages ORDER BY id", (HEAD_BYTES,)):
+                number, topic, stamp, length, head = row
+                if topic not in topics or not isinstance(head, bytes) or not isinstance(stamp, int):
+                    raise FormatError(file, f"message {number}", f"topic {topic}", "a blob of a declared topic")
+                yield IndexedMessage(topics[topic], stamp, MessagePlace(file, _DATABASE_ROW, number, length), head)
         return
     if not signature:
         raise FormatError(file, "content", "no signature of a bag", f"{', '.join(BAG_SIGNATURES.values())}")
@@ -302,23 +315,6 @@ _DECOMPRESSORS: Final[dict[str, Callable[[], Any]]] = {
 
 
 # ------------------------------------------------------------------------------------------------------------ SQLite
-
-
-def _iter_rows(file: Path) -> Iterator[IndexedMessage]:
-    with _open_database(file) as database:
-        query = "SELECT id, name, type, serialization_format FROM topics LIMIT ?"
-        rows = database.execute(query, (_MAX_TOPICS + 1,)).fetchall()
-        if len(rows) > _MAX_TOPICS:
-            raise FormatError(file, "topics", f"more than {_MAX_TOPICS}", "fewer")
-        if not all(isinstance(word, str) for row in rows for word in row[1:]):
-            raise FormatError(file, "topics", "a name that is no text", "texts")
-        topics = {number: _make_topic(*words) for number, *words in rows}
-        columns = "id, topic_id, timestamp, length(data), substr(data, 1, ?)"
-        for row in database.execute(f"SELECT {columns} FROM messages ORDER BY id", (HEAD_BYTES,)):
-            number, topic, stamp, length, head = row
-            if topic not in topics or not isinstance(head, bytes) or not isinstance(stamp, int):
-                raise FormatError(file, f"message {number}", f"topic {topic}", "a blob of a declared topic")
-            yield IndexedMessage(topics[topic], stamp, MessagePlace(file, _DATABASE_ROW, number, length), head)
 
 
 @contextmanager

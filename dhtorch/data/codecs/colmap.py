@@ -99,7 +99,24 @@ def read_colmap_points(file: Path) -> dict[int, ColmapNumbers]:
     Raises:
         FormatError: a damaged file.
     """
-    return dict(_binary_points(file) if file.suffix == ".bin" else _text_points(file))
+    points: dict[int, ColmapNumbers] = {}
+    if file.suffix == ".bin":
+        cursor, track = _Cursor(file), np.dtype("<u8")
+        for _ in range(cursor.take("Q")[0]):
+            (number,) = cursor.take("Q")
+            points[number] = cursor.numbers(3)
+            cursor.take("3Bd")
+            cursor.array(track, cursor.take("Q")[0])
+        return points
+    for line, text in enumerate(files.read_lines(file)):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        words = text.split(maxsplit=8)
+        if len(words) < 8:
+            raise FormatError(file, f"line {line + 1}", " ".join(words), "POINT3D_ID, X, Y, Z, R, G, B, ERROR, …")
+        place = np.array(parse_numbers(words[1:4], 3, file, line + 1))
+        points[parse_id(words[0], file, line + 1)] = ColmapNumbers(line, place)
+    return points
 
 
 def replace_numbers(file: Path, numbers: Sequence[ColmapNumbers]) -> bytes:
@@ -185,17 +202,6 @@ def _text_images(file: Path, observations: bool) -> Iterator[_Image]:
         line, n = line + 1, n + 1
 
 
-def _text_points(file: Path) -> Iterator[tuple[int, ColmapNumbers]]:
-    for line, text in enumerate(files.read_lines(file)):
-        if not text.strip() or text.lstrip().startswith("#"):
-            continue
-        words = text.split(maxsplit=8)
-        if len(words) < 8:
-            raise FormatError(file, f"line {line + 1}", " ".join(words), "POINT3D_ID, X, Y, Z, R, G, B, ERROR, …")
-        place = np.array(parse_numbers(words[1:4], 3, file, line + 1))
-        yield parse_id(words[0], file, line + 1), ColmapNumbers(line, place)
-
-
 # -------------------------------------------------------------------------------------------------------------- binary
 
 
@@ -250,13 +256,3 @@ def _binary_images(file: Path) -> Iterator[_Image]:
         name = cursor.text()
         seen = cursor.array(observation, cursor.take("Q")[0])
         yield image_id, pose, camera_id, name, np.column_stack([seen["uv"], seen["point"]])
-
-
-def _binary_points(file: Path) -> Iterator[tuple[int, ColmapNumbers]]:
-    cursor, track = _Cursor(file), np.dtype("<u8")
-    for _ in range(cursor.take("Q")[0]):
-        (number,) = cursor.take("Q")
-        place = cursor.numbers(3)
-        cursor.take("3Bd")
-        cursor.array(track, cursor.take("Q")[0])
-        yield number, place

@@ -252,12 +252,12 @@ def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
         for number, group in enumerate(_Thrift(footer).iter_structs(4)):
             for fields in (column[3] for column in group[1]) if number in groups else ():
                 start, dictionary = int(fields[9]), int(fields.get(11) or 0)
-                kind, codec, *sizes = (int(fields[k]) for k in (1, 4, 5, 6, 7))
+                kind, codec, values, unpacked, packed = (int(fields[k]) for k in (1, 4, 5, 6, 7))
                 path = b".".join(fields[3]).decode("utf-8", "replace")
                 if min(kind, codec) < 0:
                     raise ValueError(f"type {kind} and codec {codec} of {path}")
                 start = dictionary if 0 < dictionary < start else start
-                chunks.append(_Chunk(path, _PHYSICAL_TYPES[kind], _CODECS[codec], *sizes, start))
+                chunks.append(_Chunk(path, _PHYSICAL_TYPES[kind], _CODECS[codec], values, unpacked, packed, start))
     except _DAMAGE as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
     return chunks

@@ -332,7 +332,11 @@ class _Decoder:
         try:
             # Frames up to which decoding on is cheaper than seeking a key frame.
             if not 0 <= self.next <= i <= self.next + 60:
-                self._seek(int(pts[i]))
+                # The last key frame presented at or before it, not one decoded earlier but presented later.
+                before = int(np.searchsorted(self.keys[:, 0], pts[i], "right")) - 1
+                start = int(self.keys[before, 1]) if before >= 0 else int(pts[0])
+                self.container.seek(start, stream=self.stream, backward=True)
+                self.frames = self._decoded()
             for frame in self.frames:
                 if frame.pts is None or frame.pts < pts[i]:
                     continue
@@ -345,13 +349,6 @@ class _Decoder:
             raise FormatError(self.file, f"frame {i}", error, "a decodable frame") from None
         self.next = -1
         raise FormatError(self.file, f"frame {i}", "nothing", "a decodable frame")
-
-    def _seek(self, pts: int) -> None:
-        """Seek the last key frame presented at or before ``pts``; not one decoded earlier but presented later."""
-        before = int(np.searchsorted(self.keys[:, 0], pts, "right")) - 1
-        start = int(self.keys[before, 1]) if before >= 0 else int(self.table()[0])
-        self.container.seek(start, stream=self.stream, backward=True)
-        self.frames = self._decoded()
 
     def _decoded(self) -> Iterator[Any]:
         """Decoded frames from the current position on; undecodable packets are skipped."""
