@@ -69,12 +69,6 @@ class MappedScene:
     surface: integrate.Surface
     row: Row
 
-    @property
-    def up(self) -> list[float]:
-        """Unit vector (3) upwards in the world of the map."""
-        poses = list(self.places.poses.values())
-        return estimate_up(self.recording, poses, self.surface.xyz, 2 * self.voxel, self.surface.normal)
-
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
     """Run ``dhtorch integrate``: writes a folder of files per scene, and ``result.json`` after the last one.
@@ -255,7 +249,8 @@ def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> 
 
 def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """Write the files of one scene into ``folder``; returns their paths."""
-    surface, up = scene.surface, scene.up
+    surface, poses = scene.surface, list(scene.places.poses.values())
+    up = estimate_up(scene.recording, poses, surface.xyz, 2 * scene.voxel, surface.normal)
     turn = file_from_world(settings["axes"], up)
     comments = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up, turn)
     cloud = _collect_samples(scene)
@@ -265,7 +260,7 @@ def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, 
     counts = write_colmap_workspace(folder / "colmap", scene.recording, scene.answers, scene.places.poses)
     scene.row.update({f"colmap_{name}": n for name, n in counts._asdict().items()})
     title = append_cutoff(scene.recording.name, scene.row["cutoff_m"])
-    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=scene.voxel, title=title)
+    draw_map(folder / "map.png", surface, poses, up, voxel=scene.voxel, title=title)
     return [*(folder / name for name in _MAP_FILES), folder / "colmap" / IMAGE_FOLDER]
 
 

@@ -107,7 +107,7 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     ),
     "samples.mp4": (write_samples, video.read_video_header),
     "sets.npy": (lambda file: file.write_bytes(empty_sets()), pickles.read_npy),
-    "stacks.h5": (write_stacks, hdf5.list_hdf5_arrays),
+    "stacks.h5": (write_stacks, hdf5.list_hdf5_group),
     "scans.jpg": (lambda file: file.write_bytes(many_scans()), files.read_image),
     "words.txt": (lambda file: file.write_bytes(b"1 " * 25_000_000), files.read_rows),
     "lines.txt": (lambda file: file.write_bytes(b"ab\x0b" * 10_000_000), files.read_rows),
@@ -130,7 +130,7 @@ def test_little_that_would_become_much_is_refused(tmp_path: Path, name: str, mon
 READERS: dict[str, Callable[[Path], object]] = {
     "bytes": files.read_bytes,
     "table": parquet.read_parquet_header,
-    "arrays": hdf5.list_hdf5_arrays,
+    "arrays": hdf5.list_hdf5_group,
     "archive": lambda path: list(tarballs.iter_tar_members(path)),
     "members": list_zip_members,
     "video": video.read_video_header,

@@ -72,14 +72,6 @@ def files(folder):
     return sorted(Path(folder).glob("*.parquet"))
 
 
-def seen(paths):
-    return {p.name: (p.read_bytes(), p.stat().st_ino, p.stat().st_mtime_ns) for p in paths}
-
-
-def contents(folder):
-    return {p.name: p.read_bytes() for p in files(folder)}
-
-
 class Items(torch.utils.data.Dataset):
     """What a LeRobot loader hands out: rows of the data set's own table, with its pictures."""
 
@@ -139,30 +131,6 @@ def many(tmp_path, shots):
     writers.write_counted_frames(tmp_path / "set", shots)
     place = ["data=auto", f"data.root={tmp_path / 'set'}", "out=features"]
     return [*place, "extract.gap=2", "extract.shard_rows=1", *PAPER]
-
-
-@pytest.mark.slow
-def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command):
-    """With a worker; then the same command again."""
-    args = [*many, "workers=1"]
-    process = start(tmp_path, "extract", *args)
-    assert stop(process, partial(files, tmp_path / "features"), 3, signal.SIGKILL) == -signal.SIGKILL, (
-        tmp_path / "err"
-    ).read_text()
-    before = seen(files("features"))
-    assert 3 <= len(before) < 12
-    assert all(parquet.read_table(Path("features") / name).num_rows == 1 for name in before)
-    code, out, err = command(*args)
-    assert code == 0, err
-    assert f"12 shards ({len(before)} left untouched), 12 rows" in out
-    after = seen(files("features"))
-    assert {k: after[k] for k in before} == before, "what was finished is untouched"
-    assert FeatureTable("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), (
-        "none lost, none doubled"
-    )
-    assert [p.name for p in (Path("features") / ".dhtorch").iterdir()] == ["manifest"]
-    assert command(*[a.replace("out=features", "out=whole") for a in args])[0] == 0
-    assert contents("whole") == contents("features"), "the same as without the kill"
 
 
 @pytest.mark.slow

@@ -7,14 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 from support.box_scene import BOX, HW, off_wall, walk
-from support.room_truth import room_distance
 
 from dhtorch import extend
 from dhtorch.codes import Gate, Source
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import se3, sparse_grid
+from dhtorch.geometry import se3
 from dhtorch.integrate import (
     DepthView,
     drop_unconfirmed,
@@ -76,40 +75,6 @@ def test_points_and_mesh_lie_on_the_walls_face_the_open_side_and_have_no_seams(b
     trimesh = pytest.importorskip("trimesh")
     parts = trimesh.Trimesh(meshed.xyz.numpy(), meshed.face.numpy(), process=False).split(only_watertight=False)
     assert max(len(part.faces) for part in parts) > 0.95 * len(meshed.face), "bricks are joined"
-
-
-@pytest.fixture(scope="module")
-def room():
-    """Exact depth of the built-in room from four places: volume, all that was seen."""
-    source = SyntheticRoom(lidar="exact", hw=(144, 192), supersample=1)
-    volume, seen = make_volume(0.03, channels=3), []
-    for i in (0, 3, 6, 9):
-        one = view(source[i], T=source.true_poses[i : i + 1])
-        volume = fuse_views(volume, one)
-        v, u = torch.meshgrid(torch.arange(144), torch.arange(192), indexing="ij")
-        uv = torch.stack((u, v), -1).view(1, -1, 2).float()
-        xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
-        seen.append(se3.apply(one.T_world_from_cam.to(torch.float32), xyz)[0])
-    return volume, torch.cat(seen)
-
-
-def test_the_furnished_room_is_found_exactly_and_completely_and_nothing_where_nothing_was_seen(room):
-    pytest.importorskip("skimage")
-    volume, seen = room
-    meshed, crossings = extract_mesh(volume), extract_points(volume)
-    error = room_distance(meshed.xyz)
-    assert float(error.median()) < 0.002 and float(error.mean()) < 0.006 and float(error.quantile(0.99)) < 0.05
-    cells, reach = sparse_grid.occupied_cells, volume.truncation + volume.voxel
-
-    def near(xyz, others, side):
-        """Fraction of the occupied cells that touch those of others."""
-        return float(sparse_grid.touches_cells(cells(xyz, side), cells(others, side)).double().mean())
-
-    assert near(seen, meshed.xyz, 0.03) > 0.97, "complete: what was seen is in the map"
-    for surface in (meshed, crossings):
-        assert near(surface.xyz, seen, reach) == 1 and near(surface.xyz, seen, 0.03) > 0.97
-    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 4 * 4 + 1 + (1 + 3) * 2))
-    assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
 
 
 # ------------------------------------------------------------------------------------------------------------- blending
@@ -302,28 +267,6 @@ def walked():
     room = SyntheticRoom(hw=(240, 320), n_frames=5, supersample=1, step_m=0.03)
     method = extend.replace(n=1024)
     return room, list(recording.estimate_pairs(room, method, [(0, 4)], cutoff=2.0))
-
-
-def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
-    room, answers = walked
-    places = recording.place_frames(room, answers)
-    near = recording.fuse_recording(room, make_volume(0.04), answers, places, sources=[Source.SENSOR], cutoff=2.0)
-    both = recording.fuse_recording(room, near, answers, places, sources=[Source.RECOVERED], cutoff=2.0)
-    one, two = extract_points(near), extract_points(both)
-    assert (
-        recording.measure_coverage(two.xyz, 0.04)["n_voxels"]
-        > 1.02 * recording.measure_coverage(one.xyz, 0.04)["n_voxels"]
-    )
-    new = two.xyz[two.source == Source.RECOVERED]
-    (answer,), T = answers, places.poses[0]
-    raw = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth)[answer.recovered]
-    raw = se3.apply(T, raw[None].double())[0]
-    assert len(raw) > 200 and len(new) > len(raw)
-    assert float(room_distance(new).median()) < 1.1 * float(room_distance(raw).median()), "no worse than its points"
-    assert float(torch.cdist(new.double(), raw).amin(1).quantile(0.99)) < 0.15, "and nowhere but at them"
-    assert float(two.xyz[:, 2].max()) > 1 + float(one.xyz[:, 2].max()), "farther than the sensor"
-    again = recording.fuse_recording(room, make_volume(0.04), answers, places, cutoff=2.0)
-    assert torch.equal(again.distance, both.distance) and torch.equal(again.key, both.key)
 
 
 def test_of_two_grids_each_is_what_it_is_alone_and_frames_are_read_once(walked, monkeypatch):

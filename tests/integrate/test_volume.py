@@ -151,6 +151,7 @@ def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
         xyz = (ray * (view.depth[0] + along / ray.norm(dim=-1))[..., None])[there] @ T.R[0].T + T.t[0]
         key = sparse_grid.pack_cells((xyz / 0.8).floor().long())
         assert torch.isin(key, volume.key).all(), along
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 4 * 4 + 1 + (1 + 2) * 2))
     assert len(volume.key) < 80 and torch.equal(volume.key, volume.key.sort().values)
     assert make_volume(0.1).truncation == pytest.approx(0.4), "four voxels"
 

@@ -9,6 +9,7 @@ limited to the available bytes. Protocols 2 to 5, module paths of numpy 1 and 2.
 from __future__ import annotations
 
 import gc
+import math
 import re
 import struct
 from collections.abc import Callable, Iterable
@@ -19,16 +20,6 @@ import numpy as np
 
 from dhtorch.data.codecs.npy import parse_npy_header
 from dhtorch.data.io.decode import FormatError, read_bytes
-from dhtorch.data.pickled_arrays import (
-    PERMITTED_CALLS,
-    PERMITTED_NAMES,
-    SCALAR_TYPES,
-    PendingArray,
-    PermittedName,
-    apply_state,
-    array_from_bytes,
-    check_scalar,
-)
 from dhtorch.runtime import safe_open
 
 _MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle
@@ -39,6 +30,137 @@ _BYTES_PER_VALUE: Final = {set: 500, dict: 500, list: 250, tuple: 120, float: 40
 _BYTES_PER_OTHER_VALUE: Final = 100
 
 _MARK = object()
+
+# ------------------------------------------------------------------------------------------- what a pickle may call
+#
+# An array is created in steps: an empty array, an element type, then the state with the array's bytes; numpy's own
+# unpickling is not used. ``spend(n)`` is called before ``n`` bytes are created; it raises when a file creates more
+# bytes than a file of its size can hold.
+
+_SCALAR_TYPES: Final = (str, int, float, bool, bytes, type(None))
+
+_DTYPE_PATTERN = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
+_ARRAY_NAME: Final = "numpy.ndarray"
+_SpendBytes = Callable[[int], None]
+
+
+class _PermittedName(str):
+    """Token of a permitted name; it is never resolved."""
+
+
+class _PendingDtype:
+    """Element type under construction: code such as ``f8`` and byte order."""
+
+    def __init__(self, code: str) -> None:
+        self.code, self.order = code, "="
+
+
+class _PendingArray:
+    """An array under construction, empty until its state is set."""
+
+    value: np.ndarray | list[Any] | None = None
+    shape: tuple[int, ...] = ()
+
+
+def _array_from_bytes(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
+    """Raw bytes → array, after checking that its shape matches the number of bytes.
+
+    Raises:
+        ValueError: not plain numbers or strings, or a shape that does not match the bytes.
+    """
+    if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
+        raise ValueError(f"array of {dtype}")
+    # With a zero in the shape any other length matches 0 bytes, and loops over that axis would not end: limit it.
+    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= max(len(raw), 4096) for n in shape):
+        raise ValueError(f"array shape {shape}")
+    if math.prod(shape) * dtype.itemsize != len(raw):
+        raise ValueError(f"{len(raw)} bytes for an array of {shape}")
+    array = np.frombuffer(raw, dtype).reshape(shape, order="F" if fortran else "C")
+    return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
+
+
+def _check_scalar(value: Any) -> Any:
+    """``value``, checked to be a scalar as key of a dict or member of a set (hashes of others may be expensive).
+
+    Raises:
+        TypeError: any other value.
+    """
+    if type(value) not in _SCALAR_TYPES or (type(value) is int and abs(value) >= 1 << 63):
+        raise TypeError(f"a key of type {type(value).__name__}")
+    return value
+
+
+def _fill_array(
+    spend: _SpendBytes, target: _PendingArray, shape: Any, dtype: Any, fortran: Any, raw: Any
+) -> _PendingArray:
+    if target.value is not None or type(dtype) is not _PendingDtype or type(shape) is not tuple:
+        raise TypeError("an array with an invalid state")
+    if dtype.code.lstrip("<>|=").startswith("O"):
+        if type(raw) is not list or len(shape) > 1 or len(raw) != math.prod(shape):
+            raise ValueError(f"an object array of shape {shape}")
+        target.value, target.shape = raw, shape
+    else:
+        if not isinstance(raw, bytes | bytearray) or type(fortran) is not bool:
+            raise TypeError("an array without bytes")
+        spend(len(raw))
+        target.value = _array_from_bytes(np.dtype(dtype.order + dtype.code.lstrip("<>|=")), shape, fortran, bytes(raw))
+    return target
+
+
+def _new_dtype(_spend: _SpendBytes, code: Any, *_flags: Any) -> _PendingDtype:
+    if type(code) is not str or not _DTYPE_PATTERN.fullmatch(code):
+        raise ValueError("an element type other than number, string or object")
+    return _PendingDtype(code)
+
+
+def _new_array(_spend: _SpendBytes, kind: Any, _shape: Any, _code: Any) -> _PendingArray:
+    if kind != _ARRAY_NAME or type(kind) is not _PermittedName:
+        raise TypeError("an array of another class")
+    return _PendingArray()
+
+
+def _new_scalar(spend: _SpendBytes, dtype: Any, raw: Any) -> Any:
+    array = _fill_array(spend, _PendingArray(), (), dtype, False, raw).value
+    if not isinstance(array, np.ndarray):
+        raise TypeError("a scalar of objects")
+    return array.item()
+
+
+def _from_buffer(spend: _SpendBytes, raw: Any, dtype: Any, shape: Any, order: Any) -> _PendingArray:
+    return _fill_array(spend, _PendingArray(), shape, dtype, order == "F", raw)
+
+
+def _encode(spend: _SpendBytes, text: Any, encoding: Any) -> bytes:
+    if type(text) is not str or encoding != "latin1":
+        raise TypeError("an encoding other than latin1")
+    spend(len(text))
+    return text.encode("latin-1")
+
+
+def _new_set(_spend: _SpendBytes, items: Any = ()) -> set[Any]:
+    if type(items) not in (list, tuple):
+        raise TypeError("a set that is not made from a list")
+    return set(map(_check_scalar, items))
+
+
+#: Name of a permitted function → its implementation.
+_PERMITTED_CALLS: Final[dict[str, Callable[..., Any]]] = {
+    "numpy.dtype": _new_dtype,
+    "numpy.core.multiarray._reconstruct": _new_array,
+    "numpy.core.multiarray.scalar": _new_scalar,
+    "numpy.core.numeric._frombuffer": _from_buffer,
+    "_codecs.encode": _encode,  # bytes in protocol 2
+    "collections.OrderedDict": lambda _spend: {},
+    "builtins.bytes": lambda _spend: b"",
+    "builtins.set": _new_set,  # sets in protocols 2 and 3
+}
+
+#: Names permitted in a pickle; ``numpy._core`` of numpy 2 is mapped to ``numpy.core``, ``__builtin__`` of Python 2 to
+#: ``builtins``.
+_PERMITTED_NAMES: Final = {*_PERMITTED_CALLS, _ARRAY_NAME}
+
+
+# ------------------------------------------------------------------------------------------------------- the machine
 
 
 def read_npy(file: Path) -> Any:
@@ -58,7 +180,7 @@ def read_npy(file: Path) -> Any:
     if dtype.hasobject:
         return load_pickle(body, file)
     try:
-        return array_from_bytes(dtype, shape, fortran, body)
+        return _array_from_bytes(dtype, shape, fortran, body)
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(file, "data", error, f"numbers of type {dtype}") from None
 
@@ -176,7 +298,7 @@ class _Unpickler:
         if len(items) % 2:
             raise ValueError("a key without a value")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            target[check_scalar(key)] = value
+            target[_check_scalar(key)] = value
 
     def integer(self, n: int) -> None:
         if not 0 <= n <= 16:
@@ -186,9 +308,9 @@ class _Unpickler:
     def name(self, module: Any, attribute: Any) -> None:
         text = re.sub(r"^numpy\._core\b", "numpy.core", f"{module}.{attribute}")
         text = re.sub(r"^__builtin__\b", "builtins", text)
-        if text not in PERMITTED_NAMES or type(module) is not str or type(attribute) is not str:
+        if text not in _PERMITTED_NAMES or type(module) is not str or type(attribute) is not str:
             raise FormatError(self.file, "pickle", f"the name {text}", "numpy arrays and plain containers only")
-        self.push(PermittedName(text))
+        self.push(_PermittedName(text))
 
     def line(self) -> str:
         end = self.data.index(b"\n", self.at, self.at + 256)
@@ -196,13 +318,23 @@ class _Unpickler:
 
     def call(self) -> None:
         function, args = self.pop_n(2)
-        if type(function) is not PermittedName or type(args) is not tuple:
+        if type(function) is not _PermittedName or type(args) is not tuple:
             raise TypeError("a call of a name that is not permitted")
-        self.push(PERMITTED_CALLS[function](self.spend, *args))
+        self.push(_PERMITTED_CALLS[function](self.spend, *args))
 
     def build(self) -> None:
         target, state = self.pop_n(2)
-        self.push(apply_state(self.spend, target, state))
+        if type(target) is _PendingDtype:
+            _, order, subarray, names = state[:4]
+            if order not in ("<", ">", "|", "=") or subarray is not None or names is not None:
+                raise ValueError("a structured element type")
+            target.order = order
+        elif type(target) is _PendingArray:
+            _, shape, dtype, fortran, raw = state
+            _fill_array(self.spend, target, shape, dtype, fortran, raw)
+        else:
+            raise TypeError("state of an object that is no array or element type")
+        self.push(target)
 
     def spend(self, n: int) -> None:
         self.budget -= n
@@ -221,13 +353,13 @@ class _Unpickler:
         if depth > _MAX_NESTING or self.nodes > 8 * self.steps + 64:
             raise FormatError(self.file, "pickle", "containers nested too deep", f"at most {_MAX_NESTING} deep")
         kind = type(value)
-        if kind in SCALAR_TYPES or kind is bytearray:
+        if kind in _SCALAR_TYPES or kind is bytearray:
             return value
         if kind in (list, tuple, set):
             return kind(self._plain(item, depth + 1) for item in value)
         if kind is dict:
             return {key: self._plain(item, depth + 1) for key, item in value.items()}
-        if kind is PendingArray and value.value is not None:
+        if kind is _PendingArray and value.value is not None:
             if isinstance(value.value, np.ndarray):
                 return value.value
             items = [self._plain(item, depth + 1) for item in value.value]
@@ -271,7 +403,7 @@ _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
         "\x87": lambda m: m.push(m.pop_n(3)),
         "a": lambda m: m.extend(list, m.pop_n(1)),
         "e": lambda m: m.extend(list, m.since_mark()),
-        "\x90": lambda m: m.extend(set, map(check_scalar, m.since_mark())),
+        "\x90": lambda m: m.extend(set, map(_check_scalar, m.since_mark())),
         "s": lambda m: m.set_items(list(m.pop_n(2))),
         "u": lambda m: m.set_items(m.since_mark()),
         "q": lambda m: m.remember(m.unpack("<B")),
