@@ -1,11 +1,11 @@
 """Layouts of image folders, one row of a table each: how a layout is recognised by content, and where its parts are.
 
-A row (:class:`Layout`) names the function that finds the layout, the one that lists its parts (images, depth maps, K,
-poses, unit of depth), and the file that would state K; :mod:`dhtorch.data.readers.image_folders` does the rest. Poses
-are camera-to-world with our axes unless said otherwise. Every layout has the options ``intrinsics`` (as ``K`` or
-``fov``), ``K`` (fx, fy, cx, cy of the images, in place of the stated one), ``fov`` (horizontal field of view of the
-images in degrees, for a guessed K) and ``fps`` (frame rate, for time stamps: none of them has any), beside the keyword
-options of its function. Frames without image, depth map or pose, or with a lost pose, are left out and reported.
+A row (:class:`Layout`) names the function that finds the layout and the one that lists its parts (images, depth maps,
+K, poses, unit of depth); :mod:`dhtorch.data.readers.image_folders` does the rest. Poses are camera-to-world with our
+axes unless said otherwise. Every layout has the options ``intrinsics`` (as ``K`` or ``fov``), ``K`` (fx, fy, cx, cy
+of the images, in place of the stated one), ``fov`` (horizontal field of view of the images in degrees, for a guessed
+K) and ``fps`` (frame rate, for time stamps: none of them has any), beside own ones. Frames without image, depth map
+or pose, or with a lost pose, are left out and reported.
 
 - *bop*: the BOP benchmark: ``rgb/`` or ``gray/``, ``depth/`` and ``scene_camera.json``, which maps the image's number
   to ``cam_K`` (3×3 by rows), ``depth_scale`` (code × depth_scale = mm) and, in many sets, ``cam_R_w2c`` (3×3 by rows)
@@ -135,10 +135,6 @@ def _find_bop(root: Path) -> tuple[str, Any] | None:
     sensors = {sensor: folder for sensor, folder in sorted(folders) if folder.is_dir()}  # rgb before gray
     evidence = [f"{folder.name}/, depth{sensor}/ and scene_camera{sensor}.json" for sensor, folder in sensors.items()]
     return (evidence[0], sensors) if sensors else None
-
-
-def _list_bop(root: Path, sensors: dict[str, Path]) -> list[FolderParts]:
-    return [_list_sensor(root, sensor, folder) for sensor, folder in sensors.items()]
 
 
 def _list_sensor(root: Path, sensor: str, folder: Path) -> FolderParts:
@@ -519,7 +515,7 @@ LAYOUTS = {
         Layout(
             "bop",
             _find_bop,
-            _list_bop,
+            lambda root, sensors: [_list_sensor(root, sensor, folder) for sensor, folder in sensors.items()],
             "rgb/ or gray/ with scene_camera.json",
             ("scene_gt*.json", "scene_gt_info*.json", "scene_gt_coco*.json"),
         ),
