@@ -65,8 +65,20 @@ class Corrections:
             read_as = 1.0 if recording.depth_unit is None else recording.depth_unit.metres
             load = partial(_scale_depth, recording.load, metres / read_as) if metres != read_as else recording.load
             recording = replace(recording, load=load, depth_unit=DepthUnit(metres, "option depth_unit"))
-        if self.depth_lag:
-            recording = _shift_depth(recording, self.depth_lag)
+        if lag := self.depth_lag:  # frames without depth of their own are left out
+            n, first = len(recording) - abs(lag), max(-lag, 0)
+            if n < 1:
+                raise ValueError(f"depth_lag: found {lag} for {len(recording)} frames, expected less")
+            kept = slice(first, first + n)
+            remark = f"depth is that of {format_count(abs(lag), 'frame')} {'later' if lag > 0 else 'earlier'}"
+            recording = replace(
+                recording,
+                load=partial(_lag_depth, recording.load, lag, first),
+                number=recording.number[kept],
+                times=None if recording.times is None else recording.times[kept],
+                poses=None if recording.poses is None else recording.poses[kept],
+                report=(*recording.report, remark),
+            )
         if self.pose_convention is not None and recording.poses is not None:
             convention = parse_pose_convention(self.pose_convention)
             recording = replace(recording, poses=convention.apply(recording.poses))
@@ -77,8 +89,8 @@ class Corrections:
         # Relative difference up to which a recording's rate is that of its own stamps. Source: derived: rounding.
         if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < 1e-3:
             nominal = None  # a rate that was measured by the same stamps
-        remark = describe_rate(times, nominal)
-        return recording if remark is None else replace(recording, report=(*recording.report, remark))
+        doubt = describe_rate(times, nominal)
+        return recording if doubt is None else replace(recording, report=(*recording.report, doubt))
 
 
 def _scale_depth(load: Callable[[int], Frame], factor: float, i: int) -> Frame:
@@ -91,22 +103,3 @@ def _lag_depth(load: Callable[[int], Frame], lag: int, first: int, i: int) -> Fr
     """Frame at a position with the depth of another position: that of ``lag`` frames later."""
     frame, later = load(i + first), load(i + first + lag)
     return frame.replace(depth=later.depth, conf=later.conf, depth_camera=later.depth_camera)
-
-
-def _shift_depth(recording: Recording, lag: int) -> Recording:
-    """The recording with depth moved by a lag; frames without depth of their own are left out."""
-    n, first = len(recording) - abs(lag), max(-lag, 0)
-    if n < 1:
-        raise ValueError(f"depth_lag: found {lag} for {len(recording)} frames, expected less")
-    kept = slice(first, first + n)
-    return replace(
-        recording,
-        load=partial(_lag_depth, recording.load, lag, first),
-        number=recording.number[kept],
-        times=None if recording.times is None else recording.times[kept],
-        poses=None if recording.poses is None else recording.poses[kept],
-        report=(
-            *recording.report,
-            f"depth is that of {format_count(abs(lag), 'frame')} {'later' if lag > 0 else 'earlier'}",
-        ),
-    )

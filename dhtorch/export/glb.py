@@ -53,7 +53,16 @@ def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] 
     rotation = _rotation_to_y_up(np.asarray(up, np.float64))
     for shape in shapes:
         builder.add(shape, rotation)
-    document = builder.document()
+    nodes = list(range(len(builder.nodes)))
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0}
+    document["scenes"] = [{"nodes": nodes}] if nodes else [{}]
+    if nodes:
+        material = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+        unlit = "KHR_materials_unlit"  # the colours contain the lighting already
+        document |= {"extensionsUsed": [unlit], "nodes": builder.nodes, "meshes": builder.meshes}
+        document["materials"] = [{"pbrMetallicRoughness": material, "doubleSided": True, "extensions": {unlit: {}}}]
+        document |= {"accessors": builder.accessors, "bufferViews": builder.views}
+        document["buffers"] = [{"byteLength": len(builder.data)}]
     text = storage.dump_strict_json(document, ensure_ascii=True, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
@@ -100,22 +109,6 @@ class _GltfBuilder:
             primitive |= {"indices": index, "mode": _TRIANGLES}
         self.nodes.append({"name": shape.name, "mesh": len(self.meshes), "rotation": rotation})
         self.meshes.append({"name": shape.name, "primitives": [primitive]})
-
-    def document(self) -> dict[str, Any]:
-        """The JSON chunk's document."""
-        document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0}
-        document["scenes"] = [{"nodes": list(range(len(self.nodes)))}] if self.nodes else [{}]
-        if not self.nodes:
-            return document
-        material = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
-        unlit = "KHR_materials_unlit"  # the colours contain the lighting already
-        document |= {"extensionsUsed": [unlit], "nodes": self.nodes, "meshes": self.meshes}
-        document["materials"] = [{"pbrMetallicRoughness": material, "doubleSided": True, "extensions": {unlit: {}}}]
-        return document | {
-            "accessors": self.accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": len(self.data)}],
-        }
 
     def _floats(self, values: np.ndarray, bounds: bool = False) -> int:
         kind = "VEC3" if values.ndim == 2 else "SCALAR"

@@ -24,8 +24,15 @@ class SubsampledScenes(LazySequence[Scene]):
 
     def load_item(self, place: int) -> Scene:
         """Subsampled scene at an index."""
-        scene = self.scenes[place]
-        return replace(scene, recording=subsample_recording(scene.recording, self.every, self.max_frames))
+        scene, every = self.scenes[place], self.every
+        recording = scene.recording
+        part = slice(None, None if self.max_frames is None else every * self.max_frames, every)
+        times, poses = recording.times, recording.poses
+        kept = {field.name: getattr(recording, field.name) for field in fields(Recording)}  # a subclass has others
+        load = recording.load if every == 1 else partial(_load_every, recording.load, every)
+        kept |= {"number": recording.number[part], "load": load}
+        kept |= {"times": None if times is None else times[part], "poses": None if poses is None else poses[part]}
+        return replace(scene, recording=Recording(**kept))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +53,6 @@ class SelectedRecordings(LazySequence[Recording]):
 def subsample_scenes(scenes: Sequence[Scene], every: int, max_frames: int | None) -> Sequence[Scene]:
     """Scenes -> scenes of every ``every``-th frame, of the first ``max_frames`` of these; None = all."""
     return scenes if every == 1 and max_frames is None else SubsampledScenes(scenes, every, max_frames)
-
-
-def subsample_recording(recording: Recording, every: int, max_frames: int | None) -> Recording:
-    """Recording -> recording of every ``every``-th frame, of the first ``max_frames`` of these."""
-    part = slice(None, None if max_frames is None else every * max_frames, every)
-    times, poses = recording.times, recording.poses
-    kept = {field.name: getattr(recording, field.name) for field in fields(Recording)}  # a subclass has other arguments
-    kept |= {
-        "number": recording.number[part],
-        "load": recording.load if every == 1 else partial(_load_every, recording.load, every),
-    }
-    kept |= {"times": None if times is None else times[part], "poses": None if poses is None else poses[part]}
-    return Recording(**kept)
 
 
 def _load_every(load: Callable[[int], Frame], every: int, position: int) -> Frame:

@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import names
+from dhtorch.data.codecs.tiff import decode_tiff
+from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
 from dhtorch.export.video import open_lossless_video
-from dhtorch.extract import pixel_columns, policy_columns
+from dhtorch.extract import policy_columns
 from dhtorch.extract.enriched import (
     MAP_FILES,
     MAP_STEPS,
@@ -89,17 +92,22 @@ class LeRobotTarget:
         if "geometry_image" in self.maps:
             import_optional("av")
         self.source_features: dict[str, FeatureSpec] = {} if origin is None else origin.features
-        self.unlisted = [] if as_images else pixel_columns.find_one_channel(self.source_features, "video", views)
+        # LeRobot's policies take every image and video feature as a picture of three channels: other images of one
+        # channel (depth, masks) become numbers, value for value, and such videos stay as files without a feature.
+        one_channel: dict[str, list[str]] = {"image": [], "video": []}
+        for name, feature in self.source_features.items():
+            if feature["dtype"] in one_channel and name not in views and _parse_feature(name, feature).channels == 1:
+                one_channel[feature["dtype"]].append(name)
+        self.unlisted = [] if as_images else one_channel["video"]
         #: Image columns of the source that become numbers -> their features, by the type of the first image.
         self.pixels: dict[str, FeatureSpec] = {}
         if origin is not None and not as_images:
-            one_channel = pixel_columns.find_one_channel(self.source_features, "image", views)
-            first: Any = next(iter(origin.batches(0, []))) if one_channel else None
+            first: Any = next(iter(origin.batches(0, []))) if one_channel["image"] else None
             with doors.restrict_links(origin.bounds):
-                for name in one_channel:
+                for name in one_channel["image"]:
                     cell = first.column(name)[0].as_py()
                     feature = self.source_features[name]
-                    pixels = pixel_columns.decode_cell(name, feature, cell, origin.root)
+                    pixels = _decode_cell(name, feature, cell, origin.root)
                     info = dict(feature.get("info") or {})
                     self.pixels[name] = lerobot.map_feature(pixels.shape, str(pixels.dtype), **info)
         self.keys = {view.key: self._keys(view) for view in views.values()}
@@ -252,18 +260,17 @@ class LeRobotTarget:
         if self.origin is None:
             yield from self._recording_rows(k, start, rows_by_camera, tallies, policy)
             return
-        done = 0
+        pyarrow, done = import_optional("pyarrow"), 0
         for part in self.origin.batches(k, tasks):
             table, n = part, part.num_rows
             for key, feature in self.pixels.items():  # images of one channel become numbers
                 root, spec = self.origin.root, self.source_features[key]
                 cells = table.column(key).to_pylist()
-                pictures = [pixel_columns.decode_cell(key, spec, cell, root) for cell in cells]
-                for picture in pictures:
-                    if str(picture.dtype) != feature["dtype"]:
-                        raise FormatError(
-                            root or Path(), key, picture.dtype, f"{feature['dtype']}, as in the first row"
-                        )
+                pictures = [_decode_cell(key, spec, cell, root) for cell in cells]
+                wrong = [picture.dtype for picture in pictures if str(picture.dtype) != feature["dtype"]]
+                if wrong:
+                    expected = f"{feature['dtype']}, as in the first row"
+                    raise FormatError(root or Path(), key, wrong[0], expected)
                 pixels = lerobot.nested_lists(np.stack(pictures)[:, None])
                 table = table.set_column(table.column_names.index(key), key, pixels)
             numbers = part.column("frame_index").to_pylist()
@@ -279,7 +286,21 @@ class LeRobotTarget:
                 added = {**self._cells(key, camera_rows, done), **policy[key].add(camera_rows, times)}
                 for column, values in added.items():
                     table = table.append_column(column, values)
-            yield self._renumber(table, k, start + done)
+            # Episodes are numbered from 0 and rows consecutively; changed numbers of the source are kept under
+            # ``source.``, repeated where the source has such columns of its own source.
+            for name, values in {"episode_index": np.full(n, k), "index": start + done + np.arange(n)}.items():
+                array = pyarrow.array(values.astype(np.int64))
+                if name not in table.column_names:
+                    table = table.append_column(name, array)
+                elif self.renumbered or self.version == 3:
+                    position = table.column_names.index(name)
+                    if self.renumbered:
+                        kept = f"source.{name}"
+                        while kept in table.column_names:
+                            kept = f"source.{kept}"
+                        table = table.append_column(kept, table.column(name))
+                    table = table.set_column(position, name, array)
+            yield table
             done += n
 
     def _recording_rows(
@@ -355,28 +376,6 @@ class LeRobotTarget:
                 values = [row[kind] if row is not None and row["depth"] else [float("nan")] * n for row in camera_rows]
             cells[column] = pyarrow.array(values)
         return cells
-
-    def _renumber(self, table: Any, k: int, start: int) -> Any:
-        """Number episodes from 0 and rows consecutively; changed numbers of the source are kept under ``source.``.
-
-        The prefix is repeated where the source has such columns of its own source.
-        """
-        pyarrow = import_optional("pyarrow")
-        n = table.num_rows
-        numbers = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
-        for name, values in numbers.items():
-            array = pyarrow.array(values.astype(np.int64))
-            if name not in table.column_names:
-                table = table.append_column(name, array)
-            elif self.renumbered or self.version == 3:
-                position = table.column_names.index(name)
-                if self.renumbered:
-                    kept = f"source.{name}"
-                    while kept in table.column_names:
-                        kept = f"source.{kept}"
-                    table = table.append_column(kept, table.column(name))
-                table = table.set_column(position, name, array)
-        return table
 
     def _summary(
         self,
@@ -536,7 +535,7 @@ class LeRobotTarget:
             elif total is not None:
                 entry = total.stats(frames, (len(total.n), 1, 1) if is_picture else (len(total.n),))
             if entry is None and is_picture:
-                shape = (pixel_columns.count_channels(name, feature), 1, 1)
+                shape = (_parse_feature(name, feature).channels, 1, 1)
                 source = {} if self.origin is None else self.origin.meta_file("stats.json").get(name, {})
                 shapes = [np.shape(source.get(k) or 0) for k in ("mean", "std")] if isinstance(source, dict) else []
                 entry = LogHistogram.parse([]).stats(FeatureMoments.of(np.zeros((0, 1))), frames, shape)
@@ -555,10 +554,10 @@ class LeRobotTarget:
             kind = str(table.schema.field(name).type)
             if kind.startswith("struct"):
                 feature = self.source_features.get(name)
-                if feature is None or name in self.views or pixel_columns.count_channels(name, feature) != 3:
+                if feature is None or name in self.views or _parse_feature(name, feature).channels != 3:
                     continue
                 root = None if self.origin is None else self.origin.root
-                pixels = pixel_columns.decode_cell(name, feature, table.column(name)[0].as_py(), root)
+                pixels = _decode_cell(name, feature, table.column(name)[0].as_py(), root)
                 colours = np.broadcast_to(pixels, (3, *pixels.shape[-2:])).reshape(3, -1).T
                 here = FeatureMoments.of(colours / 255)
             elif kind.count("list<") > 1:
@@ -586,3 +585,35 @@ class LeRobotTarget:
             if indices and indices == list(range(indices[0], indices[-1] + 1)):
                 consecutive[name] = f"{indices[0]}:{indices[-1] + 1}"
         return consecutive
+
+
+def _decode_cell(key: str, feature: FeatureSpec, cell: Any, root: Path | None) -> np.ndarray:
+    """Cell of an image column -> its pixels (h, w) as stored, or (3, h, w) of a colour image.
+
+    Args:
+        key: of the feature.
+        feature: its specification.
+        cell: bytes, or the path of a file below ``root``.
+        root: of the data set; None = its cells hold bytes.
+
+    Raises:
+        FormatError: no image, or one of another size.
+    """
+    place = root or Path(key)
+    data, path = ((cell or {}).get(name) for name in ("bytes", "path"))
+    if not data and root is not None and path:
+        place = files.resolve_inside(root, path, root, key)
+        data = files.read_bytes(place)
+    if not data:
+        raise FormatError(place, key, "an empty cell", "an image")
+    hw = _parse_feature(key, feature).hw
+    if data[:2] in (b"II", b"MM"):
+        return decode_tiff(data, place, hw)
+    if files.decode_image_header(data, place).bits == 16:
+        return files.decode_depth_png(data, place, 1.0, hw).astype(np.uint16)
+    pixels = files.decode_image(data, place, hw)
+    return pixels[0] if len(pixels) == 1 else pixels
+
+
+def _parse_feature(key: str, feature: FeatureSpec) -> LeRobotFeature:
+    return LeRobotFeature(key, feature["dtype"], tuple(feature["shape"]), dict(feature.get("info") or {}))

@@ -15,7 +15,8 @@ from support.known_episodes import HW, LENS
 from support.read_back import Array, linear, read_glb, same
 
 from dhtorch.codes import Hole, Source
-from dhtorch.export import ColmapImage, Shape, nerfstudio, write_colmap, write_glb, write_ply
+from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
+from dhtorch.extract import nerf_target as nerfstudio
 from dhtorch.geometry import se3
 from dhtorch.records import Camera
 
