@@ -68,6 +68,25 @@ def test_every_file_is_written_and_named_and_the_result_counts_what_was_widened(
     assert report.tables(result), "the report shows it as any other"
 
 
+def test_colmap_reads_views_and_tracks(job):
+    folder, _ = job
+    pycolmap = pytest.importorskip("pycolmap")
+    workspace = folder / "synthetic_room" / "colmap"
+    model = pycolmap.Reconstruction(str(workspace / "sparse" / "0"))
+    assert len(model.images) == 2 and len(model.cameras) == 1
+    assert {image.name for image in model.images.values()} == {p.name for p in (workspace / "images").iterdir()}
+    row = result_files.read_result(folder)["rows"][-1]
+    assert len(model.points3D) == row["colmap_n_points"] > row["colmap_n_triangulated"] > 30
+    (camera,) = model.cameras.values()
+    misses = [
+        np.linalg.norm(camera.img_from_cam(image.cam_from_world() * model.points3D[p.point3D_id].xyz) - p.xy)
+        for image in model.images.values()
+        for p in image.points2D
+    ]
+    assert len(misses) == row["colmap_n_points"] + row["colmap_n_triangulated"]
+    assert np.median(misses) < 1.0 and max(misses) < 4.001, "poses, lens and half pixels agree, outliers are left out"
+
+
 def test_the_files_of_a_map_have_one_set_of_axes_and_sources(job):
     folder, _ = job
     trimesh = pytest.importorskip("trimesh")
