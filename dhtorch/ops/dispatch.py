@@ -79,7 +79,7 @@ def operator(
                 bound.apply_defaults()
                 args, kwargs = bound.args, bound.kwargs  # type: ignore[assignment]
             inner = () if nested is None else nested(*args, **kwargs)
-            is_eligible = can_dispatch(args, parameters) and can_dispatch(tuple(inner), (_NESTED,) * len(inner))
+            is_eligible = _can_dispatch(args, parameters) and _can_dispatch(tuple(inner), (_NESTED,) * len(inner))
             if is_eligible and (when is None or when(*args, **kwargs)):
                 return kernel(*args, **kwargs)
             return reference(*args, **kwargs)
@@ -110,7 +110,7 @@ def is_in_use() -> bool:
     return loader.load_if_present()
 
 
-def can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:
+def _can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:
     """Whether tensors are eligible for a kernel with such parameters; see the module's last paragraph."""
     grad_enabled = torch.is_grad_enabled()
     for x, (dtypes, any_layout) in zip(tensors, parameters, strict=False):

@@ -93,7 +93,7 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(len(frame.image), *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    limits = ReturnLimits(
+    limits = _ReturnLimits(
         near_limit=near_limit,
         min_conf=min_conf,
         sigma_m=sigma_m,
@@ -118,7 +118,7 @@ def backproject(
     return samples if sensor is None else samples.replace(sigma=get_sensor_noise(sensor)(samples.depth))
 
 
-class ReturnLimits(NamedTuple):
+class _ReturnLimits(NamedTuple):
     """Thresholds of returns and flags: options of :func:`backproject`."""
 
     near_limit: float | None
@@ -201,7 +201,7 @@ def _project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # Samples read the nearest pixel of a dense map, with a confidence threshold that fits a byte.
     when=lambda *_, frame, search_px, limits: not search_px and frame.sparse is None and 0 <= limits.min_conf <= 255,
 )
-def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: ReturnLimits) -> Samples:
+def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: _ReturnLimits) -> Samples:
     """:func:`backproject` of a frame; ``tensors`` are the frame's tensors that the kernel reads, and uv (B, N, 2)."""
     uv = tensors[3]
     pixel = containing_pixels(uv)
@@ -326,7 +326,7 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     return torch.where(reachable.gather(-1, pick), nearest.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Tensor, ...]:
+def _appearance(image: Tensor, pixel: Tensor, limits: _ReturnLimits) -> tuple[Tensor, ...]:
     """Flags (B, N) from the image alone: border, underexposed, saturated, highlight."""
     hw = (image.shape[-2], image.shape[-1])
     size = min(NEIGHBOURHOOD_PX, *hw)
