@@ -1,7 +1,5 @@
 """Cohorts beyond the range split (hold-out, real holes), and relative poses from the device's trajectory."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

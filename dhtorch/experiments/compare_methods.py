@@ -5,8 +5,6 @@ error halves and one where it doubles cancel. Calibrated score, sigma and thresh
 evaluated on that one, with the seeds of a scene pooled and every scene of the same weight.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Exhibits for the viewer: images, point clouds, camera path and samples of a method's run on a recording."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Sequence

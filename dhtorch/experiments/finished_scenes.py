@@ -5,8 +5,6 @@ written when it is finished, one file per loop and scene; the next run of the sa
 The files hold tensors, records, numbers and texts alone and are read without executing code.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """Pairs of a recording, loaded in batches for a protocol, and chunks of frames for the probes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Memory of a call: its learned weights, and the peak of a process that runs nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -3,8 +3,6 @@
 It has no question (question, expectation and verdict are null), unlike the other experiments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from dhtorch.data.scene import SceneLike

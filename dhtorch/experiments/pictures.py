@@ -1,7 +1,5 @@
 """Figures and point cloud of one pair."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Given relative poses (device trajectory, oracle) as a :class:`PoseFit`, for the option ``fit`` of a method."""
 
-from __future__ import annotations
-
 import torch
 
 from dhtorch.codes import PoseCode

@@ -4,8 +4,6 @@ The cost of a forward pass does not depend on the values of the weights, so rand
 need the real ones, from a local file or folder. Nothing is ever downloaded.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

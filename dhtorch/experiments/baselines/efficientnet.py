@@ -6,8 +6,6 @@ blocks is built here from their shapes. Images are resized to a square; features
 Source: M. Tan, Q. Le, "EfficientNet", 2019; Lite has ReLU6 in place of swish and no squeeze-and-excitation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path

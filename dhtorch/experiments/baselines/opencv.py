@@ -3,8 +3,6 @@
 All functions loop over the batch and have no gradient.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -4,8 +4,6 @@ Both estimate depth at the method's samples under the method's relative pose. Th
 gradient nor sigma; their score only orders answers.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import cv2

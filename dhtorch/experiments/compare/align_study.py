@@ -14,8 +14,6 @@ The constants of :mod:`dhtorch.alignment.error_model` and :mod:`dhtorch.alignmen
 sensor here: a near-only fit of a rescaled map is nearly exact, more than a network's would be.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial

@@ -8,8 +8,6 @@ where the camera only turns, and one answer in twenty at most is wrong by a fift
 What would refute it: any of these numbers missed.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -12,8 +12,6 @@ the candidates that ours answered (the paper: 2.5 % against 6.7 %).
 What would refute it: a larger median error of VGGT on half of the scenes or more. Without VGGT nothing is decided.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -11,8 +11,6 @@ more than the floor that is printed for the scene's own truth.
 What would refute it: any of these numbers missed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import product

@@ -6,8 +6,6 @@ degrees (median), within one stated sigma in 61 to 75 % and within two in 92 % a
 What would refute it: any of these numbers missed.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence

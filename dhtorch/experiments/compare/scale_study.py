@@ -17,8 +17,6 @@ Constants of :mod:`dhtorch.measure.local_scales` were chosen on the room of seed
 and 7s_redkitchen_stream_000: rooms and models are others here, those two scenes are the same.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

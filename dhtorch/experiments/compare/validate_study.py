@@ -9,8 +9,6 @@ area under the curve of .95 where something is said.
 What would refute it: any of these numbers missed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -8,8 +8,6 @@ focus and beyond it (*side*).
 Alphabet: ``sigma`` px, standard deviation of the blur; ``side`` −1 in front of the focus, +1 beyond it.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

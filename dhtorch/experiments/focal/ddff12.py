@@ -7,8 +7,6 @@ the HDF5 files are not documented: both are taken from the file, and images with
 1 instead of 0 to 255.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

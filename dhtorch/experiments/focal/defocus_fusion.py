@@ -13,8 +13,6 @@ What would refute it: a mean error of ``defocus_guided`` below that of ``bilinea
 never lower, and not higher in the median either.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

@@ -7,8 +7,6 @@ interpolation, and the two filters that make a coarse depth map follow the edges
 Alphabet: ``coarse`` (B, h, w) m, 0 = no return, covering the same field as ``guide`` (B, C, H, W); ``dense`` (B, H, W).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -14,8 +14,6 @@ What would refute it: a clean Spearman below 0.5; or on light fields a Spearman 
 gated |r| of 0.5 or more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

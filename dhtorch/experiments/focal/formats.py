@@ -1,7 +1,5 @@
 """Open focal stacks of any supported format: ``open_stacks(path)``; FoD500 and folders of images."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -8,8 +8,6 @@ Alphabet: ``images`` (B, S, C, H, W), S images of one view; ``measured`` (B, S, 
 fractional index in the stack.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.geometry.transform import remap
 from torch import Tensor

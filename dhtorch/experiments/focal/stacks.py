@@ -1,7 +1,5 @@
 """Focal stacks: images of one view at several focus distances, as records and lazy sequences, and their file input."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

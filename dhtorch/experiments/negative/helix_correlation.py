@@ -13,8 +13,6 @@ What would refute it: over the scenes, the median r of ``own_arm`` reaches half 
 ``flow`` on half of them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

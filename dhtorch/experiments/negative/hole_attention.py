@@ -10,8 +10,6 @@ classes say which may be triangulated, which need another exposure, which a head
 What would refute it: on half of the scenes the hole rate does not rise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -14,8 +14,6 @@ What would refute it: on half of the scenes point-to-point ICP over the good pos
 alone, most of its links are confident, or without a pose it fails to end nearer to the truth on half of them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -6,8 +6,6 @@ part improves the median error over scenes by more than a tenth.
 What would refute it: one change of one part lowers the median error ratio (geometric mean over scenes) below 0.9.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace

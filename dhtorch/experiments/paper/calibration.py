@@ -6,8 +6,6 @@ What would refute it: on the median scene the area under the risk–coverage cur
 answers (no order), or the expected calibration error is at most 0.1 (calibrated after all).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from dhtorch.data.scene import SceneLike

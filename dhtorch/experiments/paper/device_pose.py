@@ -8,8 +8,6 @@ most as large as the anchored pose. (On data sets whose trajectory comes from a 
 registration this may well happen: they are not a phone's.)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -6,8 +6,6 @@ little and coverage falls with the gap.
 What would refute it: taking away the parallax gate does not cost more correlation than taking away the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -12,8 +12,6 @@ What would refute it: along the device's poses the fused map covers no more voxe
 scenes, or has fewer islands on more than half of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

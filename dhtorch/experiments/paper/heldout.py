@@ -8,8 +8,6 @@ What would refute it: the 95 % interval of the median ratio of the two errors li
 fewer than half the scenes pass the strict line. Undecided where the interval holds five and the ratio is below it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any

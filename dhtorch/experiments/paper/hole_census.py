@@ -6,8 +6,6 @@ What would refute it: on the median scene fewer than half of the holes are of th
 is below a tenth of that of samples with a return.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -11,8 +11,6 @@ What would refute it: a ratio below 96, or a growth above 3.4, beyond the spread
 the machine's own and decide nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform

@@ -7,8 +7,6 @@ What would refute it: over the pairs of the median scene the share of recovered 
 not fall, with the baseline.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

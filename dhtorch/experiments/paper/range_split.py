@@ -7,8 +7,6 @@ What would refute it: on the median scene the gated method answers fewer than a 
 is not below that of the device's trajectory as the device writes it, or the gates do not lower p90.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

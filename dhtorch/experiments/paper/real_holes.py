@@ -5,8 +5,6 @@ median scene their error is larger, and some scenes have no answer at all.
 What would refute it: on the median scene the error on real holes is not above that on hidden returns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

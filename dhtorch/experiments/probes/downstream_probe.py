@@ -16,8 +16,6 @@ Undecided in between, and where a control fails: noisy true motion must beat the
 the true depth must beat the sensor's, or there is nothing that any depth beyond the cut-off could add.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial

@@ -4,8 +4,6 @@ Every front end computes feature vectors of a fixed length with finite values, w
 do not depend on the others of its batch. The frames of a batch have images of one size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol

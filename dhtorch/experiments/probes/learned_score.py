@@ -6,8 +6,6 @@ of the area under the risk–coverage curve lies below that of the paper's score
 What would refute it: either ratio is 1 or more. An interval that reaches 1 leaves it undecided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -21,8 +21,6 @@ user, the paper's training and test sets share task numbers and objects, and its
 Intervals here come from resampling tasks: about 146 units of RH20T, not 799.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial

@@ -10,8 +10,6 @@ leading dimensions. Penalties are per sample and in units of standardised featur
 error + penalty · |w|², so that one grid serves sets of all sizes (scikit-learn's ``alpha`` is N times as large).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from random import Random

@@ -15,8 +15,6 @@ Undecided in between, where the controls fail (:mod:`dhtorch.experiments.probes.
 which say nothing about DINOv2. An undecided ratio comes with the number of rooms or blocks that would show the paper's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise

@@ -7,8 +7,6 @@ of the paper, beside the figures in ``published``; ``figures`` draws matplotlib 
 sweep; ``text`` and ``page`` write the output.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Values of archived results (variants, cohorts, rows of scenes, metrics of rows and summary), and their cells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Figures of a result from its rows and summary, as matplotlib axes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

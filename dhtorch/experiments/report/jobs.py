@@ -4,8 +4,6 @@ Which metrics are the main ones, and which of their values is better, is named b
 result without such names, those of experiments on depth are taken, and if it has none of these its first metrics.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence

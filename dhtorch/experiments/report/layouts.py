@@ -3,8 +3,6 @@
 A table is (title, columns) or (title, columns, the paper's table, lines); what is no such list is a function.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace

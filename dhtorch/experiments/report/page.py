@@ -1,7 +1,5 @@
 """Results as one self-contained HTML page: tables, figures, settings, verdicts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path

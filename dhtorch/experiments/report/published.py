@@ -6,8 +6,6 @@ are its own: none of these figures was measured on the scenes of a result shown 
 it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Archived results as tables of text cells: the generic tables of every experiment and builders for the layouts."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

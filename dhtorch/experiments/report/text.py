@@ -1,7 +1,5 @@
 """Output of tables on the console and as Markdown."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable
 from typing import Any
