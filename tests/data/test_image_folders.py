@@ -234,6 +234,8 @@ CASES = [
           "report": ("images of 64x48, cam_params.json states K for 128x96: K is scaled",)}),
     Case("K of another shape is refused", replica, 1, [("cam_params.json", {"camera": STATED_K | {"h": 128}})],
          error="image size: found 128x128, expected 64x48 as the images"),
+    Case("K of no size is refused", replica, 1, [("cam_params.json", {"camera": STATED_K | {"w": 0.1}})],
+         error=r"cam_params.json: image size: found 0x96, expected 64x48"),
     Case("K of another shape, an option", replica, 1, [("cam_params.json", {"camera": STATED_K | {"h": 128}})],
          {"f": F, "report": ()}, options={"K": OPTION_K}),
     # ScanNet, SensReader, 3RScan

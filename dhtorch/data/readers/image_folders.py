@@ -582,7 +582,7 @@ def fit_K(
     # Aspect ratios of one image at two sizes: rounding of the shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's
     # 1296×968 differs from 640×480 by 0.4 %.
     files.refuse_if(
-        abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01,
+        min(stated_hw) < 1 or abs(stated_hw[0] * hw[1] / (stated_hw[1] * hw[0]) - 1) > 0.01,
         file,
         "image size",
         sizes[1],
