@@ -23,8 +23,6 @@ The numbers: ``silent`` must be 0; ``named`` or ``right`` or ``refused`` at leas
 windows without a fault (false alarms) at most 2 %.
 """
 
-from __future__ import annotations
-
 import argparse
 import concurrent.futures
 import functools
@@ -228,7 +226,9 @@ def _upright(frame: Frame) -> Frame:
     return frame.replace(depth_camera=None)
 
 
-def run_row(frames: Frames, layout: str, fault: PlantedFault, sound: Sound | None, root: Path) -> dict[str, Any] | None:
+def run_row(
+    frames: Frames, layout: str, fault: PlantedFault, sound: "Sound | None", root: Path
+) -> dict[str, Any] | None:
     """One window in one layout with one fault → outcome; None where it cannot be planted.
 
     ``sound``: the same window and layout read without a fault; None = this is that row.

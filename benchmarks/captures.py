@@ -6,8 +6,6 @@ As a user has it, a process each, but for half a minute a capture instead of fou
 ``first_s`` is the time from the start of the process until the first preview exists.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What the tables of readme.py share: the result files, how numbers stand in cells, and Markdown."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from functools import cache

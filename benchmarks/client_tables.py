@@ -1,7 +1,5 @@
 """Table of readme.py: clients by version and command, from the result files of ``clients/``, with what helps."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from typing import NamedTuple

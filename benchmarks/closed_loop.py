@@ -24,8 +24,6 @@ networks each, from other seeds; all drive the same test episodes. Intervals are
 networks of an episode together.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Mapping, Sequence

@@ -8,8 +8,6 @@ pictures to disparities, without reading them back into the view. Frames of the 
 1440×1920 with ``size=640``, where the peer's pictures are made as small. Both sides take turns in one process.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

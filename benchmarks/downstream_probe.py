@@ -8,8 +8,6 @@ therefore remains in the set as the truth. A set that exists is kept, and an int
 features of the experiment.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

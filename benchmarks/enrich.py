@@ -11,8 +11,6 @@ the sensor has one (within half a step), intrinsics, poses, columns, bytes of vi
 the sets is in ``benchmarks/results/clients.json``, by the same names of source and target.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

@@ -6,8 +6,6 @@ The files of most scenes are those of a commit of a public repository, which ``m
 the archives of the benchmark, whose own digests are unknown here: the digests of their files are checked instead.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

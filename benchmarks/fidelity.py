@@ -4,8 +4,6 @@ Used by ``readme.py`` for docs/results/fidelity.md. The paper's captures are its
 either side; it says how far a finding carries.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

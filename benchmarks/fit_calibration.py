@@ -12,8 +12,6 @@ scenes: tracks in the built-in rooms are cleaner than a phone's. What the same r
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

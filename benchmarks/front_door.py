@@ -9,8 +9,6 @@ in an empty folder, with few frames. A role ends in ``ok``, in one sentence with
 expected. Results are added to the file, so that several runs complete it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -11,8 +11,6 @@ Before them, a pipe, a socket, a device, a folder and a file of 3 GiB stand in t
 1 where one is neither valid data nor a FormatError in one line.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

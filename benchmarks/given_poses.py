@@ -7,8 +7,6 @@ the near returns' own pose are found once; what changes is the pose that is give
 each capture, method, pose and use.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections import Counter

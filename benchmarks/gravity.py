@@ -8,8 +8,6 @@ that are fitted to points, as ``dhtorch.integrate.level`` does. A row for each r
 DHTORCH_DATA; where nothing can be measured the row says why.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -6,8 +6,6 @@ peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faste
 (:func:`measure_rates`).
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

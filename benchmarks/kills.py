@@ -11,8 +11,6 @@ record of the first run: ``deleted`` counts those that are gone or changed after
 are forked off a process that has imported what they need, so that faults hit work, not imports.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import hashlib

@@ -1,7 +1,5 @@
 """Tables of docs/learning.md: a recovered calibration, far labels for a network, a confidence trained on its risk."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -16,8 +16,6 @@ Pairs of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; ever
 set up by ``one_thread``: one thread, and what is freed is kept.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext

@@ -12,8 +12,6 @@ its function are run there in a fork of one process that has torch loaded, most 
 seconds of tests. A fault that a rule of ``EQUIVALENT`` proves to change no answer is drawn again.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import gc

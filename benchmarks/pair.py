@@ -13,8 +13,6 @@ Mode ``compiled`` is ours with the compiled code of ``python -m dhtorch.ops``, w
 that it shares.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 from collections.abc import Callable

@@ -5,8 +5,6 @@
 The capture is the built-in room as a Stray Scanner folder: HEVC video of 1440×1920, depth of 192×256 to three metres.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """Tables of poses from elsewhere, of rigs and of gravity; see readme.py."""
 
-from __future__ import annotations
-
 import statistics
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of readme.py: other projects' readers of our files, and a small radiance field with our depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from cells import percent, read, table

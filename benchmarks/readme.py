@@ -8,8 +8,6 @@ in the paper's layout, ``<!-- make: name argument -->`` what a function
 of docs/hooks.py says. The pages are committed whole. Pictures: docs/pictures.py.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import statistics

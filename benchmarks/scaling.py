@@ -8,8 +8,6 @@ pixels. Peak memory is what a process of its own needs above its inputs, after o
 the libraries. The last rows are the largest batch that is promised to fit: 32 pairs with 4096 samples.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Callable, Sequence

@@ -15,8 +15,6 @@ Rows that the JSON file already has are kept, so that an interrupted run continu
 A constant whose change moves neither number by more than ``--epsilon`` is marked: a candidate for removal.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Tables of the timing scripts' result files, for docs/results/speed.md; see readme.py."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -9,8 +9,6 @@ for; ``start_extend`` also the method, and ``start_names`` everything that ``fro
 kept (``torch.compiler.save_cache_artifacts``) and the worker loaded, beside a worker that compiles for itself.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

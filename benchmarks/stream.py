@@ -10,8 +10,6 @@ triangulated. Frames of 7s_redkitchen_stream_200 (640×480, near limit 2 m) wher
 built-in room. All sides take turns in one process.
 """
 
-from __future__ import annotations
-
 import os
 from functools import partial
 from pathlib import Path

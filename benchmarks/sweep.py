@@ -6,8 +6,6 @@ A row holds what a job was told otherwise than the others (``overrides``) and th
 time of a pair, on whatever machine, beside whatever else it does.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

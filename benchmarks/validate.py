@@ -10,8 +10,6 @@ or more of frames in a row each, as a data set is validated. The peer needs a re
 method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

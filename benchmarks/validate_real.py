@@ -6,8 +6,6 @@ A row for each recording: what is said of the sensor's own depth, of the whole a
 With ``--pages`` the pages with the pictures are kept there.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

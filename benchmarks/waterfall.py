@@ -8,8 +8,6 @@ room), and once ``dhtorch PATH`` on eight frames of holo_a (with DHTORCH_DATA). 
 parts within it; ``other`` is the rest of the call. ``ratio`` is the share of the call.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import sys

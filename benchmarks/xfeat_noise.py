@@ -9,8 +9,6 @@ constants. Matches further off than a cell are wrong ones, no noise, and stay ou
 in rooms of other seeds: shares of the errors within one and two stated sigmas, over all matches and by similarity.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -7,8 +7,6 @@ combines its estimate with the sensor's returns.
 Names are imported on first access: ``dhtorch --help`` runs without loading torch.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from typing import TYPE_CHECKING, Any
 

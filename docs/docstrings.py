@@ -5,8 +5,6 @@ stand behind arguments and fields as comments, and names are marked as Sphinx do
 text, the words and the marks plain Markdown.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -5,8 +5,6 @@ returns; ``python benchmarks/readme.py`` writes it there, so that the pages are 
 the API and of the notebooks are made while the site is built.
 """
 
-from __future__ import annotations
-
 import ast
 import base64
 import contextlib

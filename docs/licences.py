@@ -3,8 +3,6 @@
 Licences are read from the installed packages; ``ELSEWHERE`` states those of packages that an environment may lack.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from functools import cache

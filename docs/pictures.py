@@ -9,8 +9,6 @@ beyond 2.5 m hidden; ``viewer`` is the page of ``dhtorch view``, turned by a hea
 rooms, holo_a and holo_stream (MIT), tum_fr1_desk9 (TUM, CC BY 4.0) and the three cameras of dgp_drive6cam (MIT).
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import io

@@ -8,8 +8,6 @@ changed from the command line, and a misspelt one is refused by the settings alo
 function's docstring has for the option.
 """
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import math

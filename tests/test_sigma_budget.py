@@ -1,7 +1,5 @@
 """The budget of sigma by cause and its intervals: sums, single causes, gradients, on the rules and on the room."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -8,8 +8,6 @@ interpreters with a colon between. A loader without an interpreter gets a row th
 ``DHTORCH_DATA``, beside two that are written first (``written.py``).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -249,7 +247,7 @@ def _subject(row: dict[str, Any]) -> tuple[str, str, str]:
 class Served:
     """An interpreter in which scripts run one after the other (``serve.py``); it ends with this process."""
 
-    known: ClassVar[dict[str, Served]] = {}
+    known: ClassVar["dict[str, Served]"] = {}
     alone: ClassVar[threading.Lock] = threading.Lock()
 
     def __init__(self, python: str) -> None:
@@ -261,7 +259,7 @@ class Served:
         self.lock = threading.Lock()
 
     @classmethod
-    def of(cls, python: str) -> Served:
+    def of(cls, python: str) -> "Served":
         """The one of an interpreter, started where there is none or the last one died."""
         with cls.alone:
             if python not in cls.known or cls.known[python].process.poll() is not None:

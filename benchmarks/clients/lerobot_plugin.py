@@ -7,8 +7,6 @@ they are; this interpreter needs pip and setuptools. For each of :data:`VERSIONS
 FILE holds are kept; where there are none, they say ``not run``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ the rows that FILE holds are kept; where there are none, they say ``not run``. A
 named by a script that enters it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -8,8 +8,6 @@ reader gets the numbers that the files hold, not how good they are. A reader tha
 *not run*.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.metadata
 import importlib.util

@@ -8,8 +8,6 @@ these with the depth that ``complete_depth`` adds from the same pictures; its pi
 between the fitted ones, and all hidden returns there, evaluate.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import time

@@ -1,7 +1,5 @@
 """Sets written here for what no real one at hand has: actions and depth at once, from two cameras; RLDS with depth."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Sequence

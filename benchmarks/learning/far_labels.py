@@ -15,8 +15,6 @@ error beyond the near limit on held-out frames of the same rooms: blocks of cons
 on nor source views of any label. The real captures need DHTORCH_DATA.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor

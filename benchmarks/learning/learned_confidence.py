@@ -17,8 +17,6 @@ rate and temperature were chosen on the built-in rooms, which share one layout; 
 decide.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -13,8 +13,6 @@ A capture has errors of its own, which nothing tells apart from planted ones. Th
 errors recovered from the capture with planted ones, less those recovered from the capture as it is.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping

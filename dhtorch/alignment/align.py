@@ -11,8 +11,6 @@ predicts left-out references better; otherwise the map is left unchanged.
 Alphabet: ``x`` value of the map, ``r`` residual of log depth, ``K`` models, ``M`` the most probable ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 

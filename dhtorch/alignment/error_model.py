@@ -9,8 +9,6 @@ log depth; ``xi`` all unknowns in prior standard deviations; ``r`` residual of l
 models; ``P`` unknowns, ``Q`` of them beside the head.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import torch
@@ -122,7 +120,7 @@ class ErrorModelFit(NamedTuple):
     noise: Tensor  # (B, K, 2) factors on the stated noise of near and far references
     evidence: Tensor  # (B, K) log probability of the references; -inf where the fit failed
 
-    def pick(self, at: Tensor) -> ErrorModelFit:
+    def pick(self, at: Tensor) -> "ErrorModelFit":
         """The fits (B, K') of the models at indices ``at`` (B, K') among these."""
         picked = (
             part.gather(1, at.view(*at.shape, *(1,) * (part.dim() - 2)).expand(-1, -1, *part.shape[2:]))

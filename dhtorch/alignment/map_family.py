@@ -5,8 +5,6 @@ disparity map or a z-buffer that is read as depth is not, and drift would hide t
 returns would be answered as if it followed from them.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

@@ -1,7 +1,5 @@
 """Tuning constants of the alignment of depth maps, one record with a default for each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -3,8 +3,6 @@
 Alphabet: ``x`` value of the map at a reference, ``depth`` of the reference, m, ``var`` variance of its logarithm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 

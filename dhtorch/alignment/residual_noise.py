@@ -16,8 +16,6 @@ Alphabet: ``r`` residual of log depth at references; ``read`` its variance by th
 roughness of the map; ``G`` candidates of a level.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

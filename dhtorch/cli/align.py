@@ -5,8 +5,6 @@ where the format allows. ``align.json`` holds the alignment of every map, ``alig
 The exit code is 1 where a limit of ``fail_on`` is exceeded.
 """
 
-from __future__ import annotations
-
 import io
 import statistics
 from collections import Counter

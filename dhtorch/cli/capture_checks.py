@@ -4,8 +4,6 @@ All commands call it on the recordings of their data, so that one capture gives 
 lines become the recordings' report, which the commands write into their files.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable, Sequence

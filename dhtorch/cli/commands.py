@@ -3,8 +3,6 @@
 Defaults and descriptions of options are read from the comments of ``conf/NAME.yaml``, so that each is written once.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence

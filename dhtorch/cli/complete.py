@@ -13,8 +13,6 @@ capture's own format where that can hold the maps. A second run of the command m
 - ``png``: the maps alone, as ``frames``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -10,8 +10,6 @@ is, versions, the licence of the source, and how the set is loaded and trained o
 ``README.source.md``.
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import re

@@ -5,8 +5,6 @@ come one by one from a base address, or out of an archive; some are cut to the f
 first. An interrupted download goes on where it stopped; nothing gets its name before its digest is right.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import http.client

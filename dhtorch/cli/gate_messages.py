@@ -1,7 +1,5 @@
 """Why pixels have no answer, in words for a person: what a gate's code means, and what would help."""
 
-from __future__ import annotations
-
 from dhtorch.codes import Gate, describe, words
 
 #: Reasons that are no gates -> what they mean.

@@ -4,8 +4,6 @@ Captures are searched for at the path and up to two folders below it: recordings
 of no known format.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import sys

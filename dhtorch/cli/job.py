@@ -3,8 +3,6 @@
 The result is written last, after its figures: a folder with a valid ``result.json`` holds all output of the job.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging

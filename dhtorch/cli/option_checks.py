@@ -4,8 +4,6 @@ Values of a function's options are compared with its annotations, options of no 
 :data:`_OPTION_RULES`, and lower limits of numbers follow from their names. A new stage or reader needs no entry here.
 """
 
-from __future__ import annotations
-
 import collections.abc
 import importlib
 import inspect

@@ -4,8 +4,6 @@ Prints a line per picture or episode, and writes ``pin.json`` and ``pin.html``, 
 where a limit of ``fail_on`` is exceeded, for use in data pipelines.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -5,8 +5,6 @@ second run continues.
 A capture from which nothing can be recovered gives one sentence with the reason and the remedy.
 """
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import io

@@ -5,8 +5,6 @@ that name; otherwise all arguments are Hydra overrides of an experiment. Each jo
 overrides in a sweep, and returns its state instead of raising, so that a failing job stops no other, with any launcher.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -5,8 +5,6 @@ refused, the files of the model with all lengths in metres. A model whose parts,
 different scales is refused with exit code 1.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from pathlib import Path

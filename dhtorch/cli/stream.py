@@ -1,7 +1,5 @@
 """``dhtorch stream``: a recording processed frame by frame -> speed and recovered fraction of every frame."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Mapping

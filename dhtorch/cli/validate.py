@@ -4,8 +4,6 @@ Writes ``validate.json`` (a row for every frame, statistics of the recording, li
 ``validate.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, for use in data pipelines.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import re

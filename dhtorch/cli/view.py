@@ -1,7 +1,5 @@
 """``dhtorch view``: a result or recording -> 3D viewer (Rerun), .rrd file or HTML page."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import sys

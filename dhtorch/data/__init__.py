@@ -5,8 +5,6 @@ format is one module with ``recognise(root)`` and ``read(root, *, options)``, on
 below. Focal stacks have one view and no depth of their own: they are read by ``dhtorch.experiments.focal``.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence

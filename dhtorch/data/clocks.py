@@ -4,8 +4,6 @@ Values are never carried over from an earlier instant: a time without a stamp wi
 Alphabet: ``times`` (n,) s, query times; ``others`` (m,) s, stamps of the other stream, sorted, at least one.
 """
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -145,7 +143,7 @@ class _Fit:
     error: float  # mean distance of the pairs, steps
 
     @classmethod
-    def of(cls, pictures: np.ndarray, rows: np.ndarray, speed: float, start: int) -> _Fit:
+    def of(cls, pictures: np.ndarray, rows: np.ndarray, speed: float, start: int) -> "_Fit":
         """Each picture's nearest later row within ``_MAX_PAIR_STEPS``, the offset of the clocks following slowly."""
         step, stamps = float(np.median(np.diff(rows))), rows.tolist()
         offset = stamps[max(start, 0)] - speed * float(pictures[max(-start, 0)])

@@ -5,8 +5,6 @@ Alphabet: ``K`` 3×3 intrinsics; ``c2w`` camera-to-world 4×4 (maps camera point
 return records; values that are no camera or rigid motion raise ``FormatError`` with the file they came from.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Files may mean something else than their layout suggests, which a capture check 
 that its warning names. Orientation and rate of every recording are checked here too, since all of them pass.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -36,7 +34,7 @@ class Corrections:
         return [each.name for each in fields(cls)]
 
     @classmethod
-    def from_options(cls, options: Mapping[str, object]) -> Corrections:
+    def from_options(cls, options: Mapping[str, object]) -> "Corrections":
         """The corrections among the options of a capture."""
         return cls(**{name: options[name] for name in cls.names() if name in options})  # type: ignore[arg-type]
 

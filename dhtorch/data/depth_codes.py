@@ -5,8 +5,6 @@ nearest distance and everything too far to the farthest; the two codes at either
 also where LeRobot has decoded the video.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final

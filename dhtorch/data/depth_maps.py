@@ -7,8 +7,6 @@ view of its frame's image at any size and is stretched where the aspect ratios d
 says. Output of ``dhtorch complete`` is read directly: the unit comes from its ``complete.json``.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections import Counter

@@ -1,7 +1,5 @@
 """Files and folders that no reader recognises: what each is or lacks, and what makes it a capture."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path

@@ -5,8 +5,6 @@ one number, the horizontal field of view in degrees. ``K`` and ``fov`` accept on
 view is a guess (square pixels, principal point at the image centre, no distortion), and is reported as such.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +34,7 @@ IntrinsicsOption = str | float | Sequence[float]
 class MissingIntrinsicsError(FormatError):
     """K of a camera is neither stored nor set by an option: its images can be viewed but not measured."""
 
-    def with_remarks(self, remarks: Sequence[str]) -> MissingIntrinsicsError:
+    def with_remarks(self, remarks: Sequence[str]) -> "MissingIntrinsicsError":
         """The error with remarks after what was found, such as files that may hold K and are not read."""
         file, field, value, expected = self.args
         return MissingIntrinsicsError(file, field, "; ".join((value, *remarks)), expected)

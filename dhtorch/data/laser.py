@@ -5,8 +5,6 @@ disagreement with the frame's own sensor over their common pixels; the sensor is
 not to serve as truth.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

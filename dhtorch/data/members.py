@@ -4,8 +4,6 @@ Nothing is unpacked to disk. A member stores the position of its bytes: it is pi
 length at no cost, and its size is known before its bytes are read.
 """
 
-from __future__ import annotations
-
 import struct
 import zipfile
 import zlib

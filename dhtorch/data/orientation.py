@@ -4,8 +4,6 @@ A *symmetry* ``k`` in 0…7 is one of the eight of a rectangle: mirrored left to
 quarter turns clockwise. ``SYMMETRY_NAMES`` has their names.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final

@@ -4,8 +4,6 @@ Indices are positions in the recording; the reference view is the frame whose de
 the capture's own frame numbers: where a frame was lost the pairs that need it are missing and the others do not shift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 

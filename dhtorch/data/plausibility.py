@@ -4,8 +4,6 @@ Only gross contradictions show in depth alone: a factor of ten, swapped bytes, s
 is consistent with another room; poses and tracks show it, not the depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 

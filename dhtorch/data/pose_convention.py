@@ -5,8 +5,6 @@ translations in metres, unless its format states otherwise. A :class:`PoseConven
 :meth:`PoseConvention.apply` takes the poses as they were read to the poses that were meant.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

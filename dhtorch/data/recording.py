@@ -4,8 +4,6 @@ Opening a recording reads names, headers and text tables; only ``recording[i]`` 
 open quickly and stream at constant memory, also from data-loader workers (recordings are picklable).
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

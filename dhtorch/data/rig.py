@@ -4,8 +4,6 @@ Frames are ordered by instant, then by camera, each with its own intrinsics; ``c
 to its camera and instant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial

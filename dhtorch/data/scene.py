@@ -4,8 +4,6 @@ A recording holds only what the capture itself contains. The depth from which re
 usable baseline, the room and whether the scene enters a mean are decisions of a benchmark, kept in the data settings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +33,7 @@ class Scene:
             object.__setattr__(self, "gap", int(self.recording.number[1] - self.recording.number[0]))
 
     @classmethod
-    def of(cls, item: SceneLike) -> Scene:
+    def of(cls, item: "SceneLike") -> "Scene":
         """The scene itself, or a recording without notes.
 
         Raises:

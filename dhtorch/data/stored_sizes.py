@@ -3,8 +3,6 @@
 Symmetries are those of :mod:`dhtorch.data.orientation`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -31,7 +29,7 @@ class StoredSizes:
     source: str = ""  # what states it: "EXIF orientation 6"
 
     @classmethod
-    def of_images(cls, hw: tuple[int, int], depth_hw: tuple[int, int] | None, exif: int) -> StoredSizes:
+    def of_images(cls, hw: tuple[int, int], depth_hw: tuple[int, int] | None, exif: int) -> "StoredSizes":
         """Sizes of an image folder, and the EXIF orientation of its first picture."""
         return cls(hw, depth_hw, EXIF_SYMMETRIES[exif], f"EXIF orientation {exif}")
 

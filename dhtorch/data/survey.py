@@ -4,8 +4,6 @@ Only a few frames, spread over the recording, are decoded, so that large capture
 raises for bad content: an unreadable frame, a missing pose or an empty depth map becomes a warning.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field

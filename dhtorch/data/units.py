@@ -1,7 +1,5 @@
 """Unit of stored depth: metres of one step, and what states it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

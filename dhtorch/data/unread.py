@@ -4,8 +4,6 @@ Names alone decide what looks so. Files that a format defines and that hold neit
 listed by its reader as ``UNUSED_FILES`` (glob patterns of names).
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Outcome of a job: rows, a summary over scenes, examples, and the answer to its question."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -152,7 +150,7 @@ class Example:
     #: Options of dhtorch.pipeline.completion.complete_depth; None for variants with a call or a pose of their own.
     call_options: dict[str, Any] | None = None
 
-    def cpu(self) -> Example:
+    def cpu(self) -> "Example":
         """Example on the CPU, for figures."""
         moved = {k: getattr(self, k).to("cpu") for k in ("frame", "samples", "estimate", "truth")}
         return replace(self, **moved)
@@ -174,14 +172,14 @@ class Outcome:
     cohort: str = "full"  # the one that the verdict and the numbers of the summary without a cohort are about
     metrics: Sequence[MainMetric] = DEPTH_METRICS  # by which the jobs of a sweep are compared
 
-    def add(self, part: Outcome) -> None:
+    def add(self, part: "Outcome") -> None:
         """Add the rows, examples, pairs and points of a part, as of one scene; the summary is not changed."""
         self.rows += part.rows
         self.examples += part.examples
         self.n_pairs += part.n_pairs
         self.points |= part.points
 
-    def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
+    def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> "Outcome":
         """Outcome with the answer to its question: True supported, False refuted, None undecided."""
         words = {True: "supported", False: "refuted", None: "undecided"}
         return replace(self, question=question, expectation=expectation, verdict=words[holds], why=why)

@@ -5,8 +5,6 @@ it is the same for every variant, also where the pose fails. A *protocol* combin
 the methods. An experiment is a protocol, a question about its rows, and a verdict.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -242,7 +240,7 @@ class Answer:
         k = int(self.trace["choice"].index[-1, 0]) if "choice" in self.trace else 0
         return pair.candidates[k], self.batch.around[k]
 
-    def one(self, b: int) -> Answer:
+    def one(self, b: int) -> "Answer":
         """Answer of pair ``b`` alone; its milliseconds are those of the batch divided by the number of pairs."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
         records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, pytree.Record)}

@@ -1,7 +1,5 @@
 """Helpers of the writers: tensors and frames -> numpy arrays, colours -> uint8, and selection of finite points."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ In COLMAP the centre of the first pixel is (0.5, 0.5), here (0, 0): half a pixel
 COLMAP's poses map world to camera.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

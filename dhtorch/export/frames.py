@@ -4,8 +4,6 @@ A 16-bit PNG holds multiples of a step, 0 is *no depth*. Depths out of range (be
 first) are left out and reported, not clipped.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from pathlib import Path

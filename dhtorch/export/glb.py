@@ -4,8 +4,6 @@ glTF's world has y up and linear vertex colours: scenes are rotated and colours 
 out glTF's points, therefore points may also be written as small squares.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping, Sequence

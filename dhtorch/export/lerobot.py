@@ -7,8 +7,6 @@ options. LeRobot's other form of depth, 12-bit video, has no code for *no return
 versions; ``meta/info.json`` is written last.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -78,7 +76,7 @@ class FeatureMoments(NamedTuple):
     high: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> FeatureMoments:
+    def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> "FeatureMoments":
         """Moments of numbers (n, k), over those that are finite and ``valid``; may be over none."""
         x = np.asarray(values, np.float64)
         keep = np.isfinite(x) if valid is None else np.isfinite(x) & valid
@@ -89,7 +87,7 @@ class FeatureMoments(NamedTuple):
         return cls(n, mean, spread, low.min(0, initial=np.inf), high.max(0, initial=-np.inf))
 
     @classmethod
-    def parse(cls, packed: Sequence[Sequence[float | None]]) -> FeatureMoments:
+    def parse(cls, packed: Sequence[Sequence[float | None]]) -> "FeatureMoments":
         """Inverse of :meth:`pack`."""
         rows = [np.array([np.nan if x is None else x for x in row]) for row in packed]
         rows[3], rows[4] = np.where(np.isnan(rows[3]), np.inf, rows[3]), np.where(np.isnan(rows[4]), -np.inf, rows[4])
@@ -99,7 +97,7 @@ class FeatureMoments(NamedTuple):
         """Lists for strict JSON; non-finite limits (of no numbers) become null."""
         return [[float(x) if np.isfinite(x) else None for x in row] for row in self]
 
-    def __add__(self, other: FeatureMoments) -> FeatureMoments:  # type: ignore[override]
+    def __add__(self, other: "FeatureMoments") -> "FeatureMoments":  # type: ignore[override]
         """Moments of the union of both sets of numbers (Chan, Golub and LeVeque 1979)."""
         n, difference = self.n + other.n, other.mean - self.mean
         weight = other.n / np.maximum(n, 1.0)
@@ -120,14 +118,14 @@ class LogHistogram(NamedTuple):
     counts: np.ndarray  # (N_BINS,) int64
 
     @classmethod
-    def of(cls, values: np.ndarray) -> LogHistogram:
+    def of(cls, values: np.ndarray) -> "LogHistogram":
         """Histogram of the numbers above 0; the others are left out."""
         x = np.asarray(values, np.float64)
         place = np.floor((np.log2(x[np.isfinite(x) & (x > 0)]) - _OCTAVES[0]) * _BINS_PER_OCTAVE)
         return cls(np.bincount(place.clip(0, N_BINS - 1).astype(np.int64), minlength=N_BINS))
 
     @classmethod
-    def parse(cls, packed: Sequence[Sequence[int]]) -> LogHistogram:
+    def parse(cls, packed: Sequence[Sequence[int]]) -> "LogHistogram":
         """Inverse of :meth:`pack`."""
         counts = np.zeros(N_BINS, np.int64)
         for place, count in packed:
@@ -138,7 +136,7 @@ class LogHistogram(NamedTuple):
         """Lists (bin, count) of the bins that are not empty, for JSON."""
         return [[int(place), int(self.counts[place])] for place in np.flatnonzero(self.counts)]
 
-    def __add__(self, other: LogHistogram) -> LogHistogram:  # type: ignore[override]
+    def __add__(self, other: "LogHistogram") -> "LogHistogram":  # type: ignore[override]
         """Histogram of both sets of numbers."""
         return LogHistogram(self.counts + other.counts)
 

@@ -1,7 +1,5 @@
 """Writer of PLY (binary, little-endian) for points and meshes; read by MeshLab, CloudCompare, Blender and Open3D."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Writer of Stray Scanner captures: a phone's film, depth in mm, confidence and poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

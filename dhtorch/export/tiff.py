@@ -1,7 +1,5 @@
 """Writer of float32 TIFF: depth maps in metres, lossless, as images in tables."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 

@@ -1,7 +1,5 @@
 """Writers of videos: lossless mp4 that decodes to the same bytes, small previews for players, films as phones write."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction

@@ -7,8 +7,6 @@ Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``d
 Parquet files, and ``features`` reads them for a data loader.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing

@@ -3,8 +3,6 @@
 Alphabet: N samples of a frame, P patches of its token grid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple

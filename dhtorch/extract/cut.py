@@ -1,7 +1,5 @@
 """Subsets of a data set, opened lazily: some frames of each recording, or selected recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial

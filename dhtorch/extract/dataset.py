@@ -1,7 +1,5 @@
 """Frame of a recording → row of features: the frame and other frames form a sample for the transform."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -93,7 +91,7 @@ class RowDataset(Dataset[ExtractedRow]):
             message = f"{recording.name}, frame {place['frame_index']}: {error}"
             return ExtractedRow(place, None, " ".join(message.split()))
 
-    def features(self, opened: OpenRecording, i: int) -> Row:
+    def features(self, opened: "OpenRecording", i: int) -> Row:
         """Frame ``i`` of an opened recording -> its columns other than the key columns."""
         reference = opened.frame(i)
         added = opened.answer(reference, opened.others(i))

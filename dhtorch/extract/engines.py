@@ -4,8 +4,6 @@ An engine yields the rows of some positions in their order. Each is computed by 
 and no worker raises: the error of a frame is part of its row.
 """
 
-from __future__ import annotations
-
 import logging
 import pickle
 import socket

@@ -1,7 +1,5 @@
 """Frame of a recording → row of an enriched data set: encoded maps, camera, and counts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,7 +63,7 @@ class DatasetCamera:
         return self.key.removeprefix("observation.").removeprefix("images.")
 
     @classmethod
-    def of(cls, scene: Scene, size: int) -> DatasetCamera:
+    def of(cls, scene: Scene, size: int) -> "DatasetCamera":
         """Recording and maximum map size -> its camera, from the first readable frame.
 
         Raises:

@@ -1,7 +1,5 @@
 """Reader of extracted features: by row, by episode and frame, or joined to their data set."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

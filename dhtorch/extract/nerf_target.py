@@ -4,8 +4,6 @@ Pixel centres are at integers here and at half-integers in nerfstudio, whose cam
 ``sparse_pc.ply`` holds points of the sure depth of all frames, from which splatfacto starts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

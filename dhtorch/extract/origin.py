@@ -1,7 +1,5 @@
 """Sources of an enriched data set: tables and videos of a LeRobot data set, frame rate of a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,7 +112,7 @@ class LeRobotSource(DatasetSource):
     @classmethod
     def open(
         cls, root: Path, numbers: Sequence[int], *, limit: int | None = None, bounds: Path | None = None
-    ) -> LeRobotSource:
+    ) -> "LeRobotSource":
         """Folder and episode numbers -> source with at most ``limit`` rows per episode.
 
         Raises:

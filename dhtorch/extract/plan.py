@@ -1,7 +1,5 @@
 """Rows of an extraction and their shards, planned before any pixel is decoded, the same on every machine."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence

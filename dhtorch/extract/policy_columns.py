@@ -1,7 +1,5 @@
 """Columns of an enriched LeRobot set for policies that take pictures or points: geometry images and point clouds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Writer of an enriched data set as LeRobot tables: one file per episode, joined from its shards and its source."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager

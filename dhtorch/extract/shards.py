@@ -5,8 +5,6 @@ settings, key, and a digest of the data. Those under ``dhtorch.shard`` belong to
 of frames by problem. No time is stored, so that the same settings and data give the same bytes.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice

@@ -1,7 +1,5 @@
 """RLDS data set as the source of a LeRobot data set: numbers, texts and encoded images of each step."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -4,8 +4,6 @@ The maps of an episode are stored in shards until all are computed; then they ar
 into one file, whose metadata hold the summary of all rows. After an interruption the file of that episode is rewritten.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ written, so that these trainers get all three without further files. Most of the
 undistorted, as ``colmap image_undistorter`` does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Fusion of a recording's saved depth maps into one surface, without another run of a method."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The upward direction of a map: from the format's gravity axis, else from the floor, the walls or the cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The command ``dhtorch integrate``: one map per recording, its files, and a result with its coverage."""
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence

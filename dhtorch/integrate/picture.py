@@ -1,7 +1,5 @@
 """Drawing of a map seen from outside, in its own colours and coloured by source."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

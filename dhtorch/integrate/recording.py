@@ -5,8 +5,6 @@ estimated between them (``anchored``). The latter link frames only where a pose 
 fall into fragments. Fragments are not joined; the map consists of the one with the most frames.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

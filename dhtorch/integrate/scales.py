@@ -5,8 +5,6 @@ more detail; for less accurate depth the views of one surface do not overlap. Se
 tenfold in sigma, so each has voxels of its own size, and the map is the union of both surfaces.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

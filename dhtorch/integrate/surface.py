@@ -5,8 +5,6 @@ There is no surface beside an unobserved voxel; a step from far in front to far 
 view's visible part, and no surface either.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -105,7 +103,7 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     return _weld_vertices(table, torch.cat(vertices), torch.cat(faces))
 
 
-def _weld_vertices(table: _VoxelTable, vertices: Tensor, faces: Tensor) -> Surface:
+def _weld_vertices(table: "_VoxelTable", vertices: Tensor, faces: Tensor) -> Surface:
     """Surface of a mesh (vertices in voxels) with one vertex per grid edge and without degenerate triangles."""
     volume, device = table.volume, table.volume.key.device
     rounded = vertices.round()
@@ -122,14 +120,14 @@ def _weld_vertices(table: _VoxelTable, vertices: Tensor, faces: Tensor) -> Surfa
     return _interpolate(table, numbers, t, position * volume.voxel).replace(face=faces[not_degenerate].to(device))
 
 
-def _interpolate(table: _VoxelTable, numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
+def _interpolate(table: "_VoxelTable", numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     """Surface points at fractions ``t`` (P,) between two voxels each, ``numbers`` (2, P), computed in chunks."""
     n = 1 << 18  # points of a chunk: bounds the memory
     parts = zip(*(x.split(n, -1) for x in (numbers, t)), xyz.split(n), strict=True)
     return collate(_interpolate_chunk(table, *part) for part in parts)
 
 
-def _interpolate_chunk(table: _VoxelTable, numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
+def _interpolate_chunk(table: "_VoxelTable", numbers: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     volume, t = table.volume, t.to(table.distance.dtype)[:, None]
     observed = ~table.at(numbers).isnan()
     index = torch.where(observed, numbers, 0)

@@ -4,8 +4,6 @@ A map is computed with the estimates of its pair but used only once the frame is
 Until then it lies in an unnamed file in half precision, so that no map stays in memory.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,7 +32,7 @@ class DenseSweep:
     calibration: Calibration = field(default_factory=default_calibration)
 
     @classmethod
-    def from_options(cls, settings: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
+    def from_options(cls, settings: bool | Mapping[str, Any] | None, name: str = "dense") -> "DenseSweep | None":
         """The sweep of the option ``dense``, None if it is off; see :func:`dhtorch.pipeline.dense.dense_options`."""
         options = dense.dense_options(settings, name)
         return None if options is None else cls(options)

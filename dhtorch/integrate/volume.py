@@ -9,8 +9,6 @@ A view updates voxels only along the rays of pixels with depth, from the camera 
 other voxels are unchanged, so that unobserved space remains unobserved.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

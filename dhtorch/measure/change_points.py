@@ -1,7 +1,5 @@
 """Offsets of a camera over time -> lasting changes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -8,8 +8,6 @@ frames. Errors that the sensor makes everywhere are common to all local scales a
 Alphabet: ``C`` local scales, ``F`` frames, ``K`` contrasts; logarithms of scales, so that a difference is a ratio.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

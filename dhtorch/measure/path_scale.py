@@ -4,8 +4,6 @@ A model whose path and depths have different scales, whose path curls, or some o
 single scale, though its depths alone may have one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -9,8 +9,6 @@ The verdict is a test of *the camera stands where it stood*: the squared Mahalan
 quantile for the stated false-alarm rate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any

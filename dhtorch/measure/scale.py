@@ -11,8 +11,6 @@ compared with the capture's poses, and where these are missing or do not show th
 by near returns.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Points of one scene share its truth, its camera and its poses; treated as indepe
 times too narrow.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

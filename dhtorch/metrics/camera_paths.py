@@ -1,7 +1,5 @@
 """Poses of the same cameras in two worlds -> the similarity between these; measured motions -> errors of a path."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

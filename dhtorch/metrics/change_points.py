@@ -1,7 +1,5 @@
 """Changes of the mean of a series of vectors: binary segmentation."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

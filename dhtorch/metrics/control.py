@@ -7,8 +7,6 @@ The unit is the scene: points of one scene share its truth and its poses and are
 are not exchangeable scenes: join them to one first (``dhtorch.pytree.collate``).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Pearson's and Spearman's correlation coefficients of two flat lists; None where undefined."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

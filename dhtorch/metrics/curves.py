@@ -1,7 +1,5 @@
 """Risk–coverage, distance and reliability curves of a scene, sampled for the figures and small in a result file."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

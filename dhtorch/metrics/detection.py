@@ -1,7 +1,5 @@
 """Detection metrics: how well a score separates wrong from right."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from dhtorch.geometry.checks import check

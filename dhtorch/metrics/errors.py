@@ -5,8 +5,6 @@ Points are pooled within a scene; scenes are combined by the median of their val
 values (no answer, no candidate, no variance) are None, written to a result file as null.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -47,7 +45,7 @@ class Points(Record):
         """(P,) relative error |z − z*| / z*; NaN where unanswered."""
         return (self.depth - self.true_depth).abs() / self.true_depth
 
-    def answered(self) -> Points:
+    def answered(self) -> "Points":
         """The answered points."""
         return self[self.keep]
 

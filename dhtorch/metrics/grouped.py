@@ -1,7 +1,5 @@
 """Means and contrasts of values whose errors last over groups of them: frames, stretches of a recording."""
 
-from __future__ import annotations
-
 import numpy as np
 
 #: Stretches of a recording within which errors are common: as many as the jackknife over them takes.

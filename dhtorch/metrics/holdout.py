@@ -5,8 +5,6 @@ registered to the pixel shows the background. A held-back return therefore count
 smooth, and every rejected return is counted under the rule that rejected it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

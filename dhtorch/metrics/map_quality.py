@@ -1,7 +1,5 @@
 """Quality of a dense map as a picture: artefacts that need no truth, and wrong answers beside true depth steps."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ Both are callables on tensors of any shape, usable in a scoring stage: they foll
 argument, have gradients, and are elementwise.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@
 An answer is *good* if its relative error is below 10 %. Every scene has the same weight, however many answers it has.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import torch

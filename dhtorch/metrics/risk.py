@@ -5,8 +5,6 @@ relative error, at most 1. Answers of equal score are indistinguishable, so each
 curve is then the expectation over all orders of the tied answers and does not depend on their order in the list.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -6,8 +6,6 @@ disjoint sets of source views differ by what their sigmas allow. The order that 
 and AUSE (:mod:`dhtorch.metrics.risk`).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ reference image, sensor ────────┼─ sweep joined with the spa
 source images ──────────────────┘
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -10,8 +10,6 @@ sweep estimates one number per pixel, its inverse depth. The sensor's returns ar
 have a depth, the returns validate the swept one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

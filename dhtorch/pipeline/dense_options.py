@@ -1,7 +1,5 @@
 """Tuning constants of dense completion, one record with a default for each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

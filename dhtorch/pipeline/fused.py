@@ -9,8 +9,6 @@ evidence: two answers that agree are surer than either and may each be uncertain
 other neither is sure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Validation of the views of a method: dtypes, channels, range of values, one device and precision, no empty frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -11,8 +11,6 @@ Alphabet: maps (B, h, w); q inverse depth (1/m), which is linear in the pixel on
 second pixel, in both directions, and only around the pixels in question.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -71,7 +69,7 @@ class _Known(NamedTuple):
         """(B, h, w) bool: a return or a swept depth."""
         return self.usable | self.swept
 
-    def without(self, which: Tensor) -> _Known:
+    def without(self, which: Tensor) -> "_Known":
         """The map without the swept depths ``which`` (B, h, w) bool."""
         return _Known(
             self.q.masked_fill(which, 0.0), self.sigma.masked_fill(which, 0.0), self.usable, self.swept & ~which

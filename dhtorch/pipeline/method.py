@@ -1,7 +1,5 @@
 """A method that can be called: the record of stages and options, joined by the pair or the multi-view pipeline."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial

@@ -8,8 +8,6 @@ Intermediate views are easier to track into than the widest one, and contradict 
 line, which a single pair cannot detect.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

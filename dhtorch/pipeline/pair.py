@@ -1,7 +1,5 @@
 """Pair pipeline: the stages of a method in sequence, two RGB-D views -> far depth with abstention; and merged depth."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -164,7 +162,7 @@ def solve_pairs(
     seed: int | Tensor,
     fit: PoseFit | PosePrior | None,  # (V · B,)
     hint: TrackHint,
-    clock: StageTimer,
+    clock: "StageTimer",
 ) -> Solved:
     """Stages 5 and 6 of V views of each reference view, (V · B) pairs; with a prior ``method.guide`` searches, too.
 
@@ -303,7 +301,7 @@ def _answer_matches(
     views: _Views,
     solved: Solved,
     solve: Callable[[Tracks, PoseFit], Solved],
-    clock: StageTimer,
+    clock: "StageTimer",
 ) -> Solved:
     """The result with unique matches of samples that no track answers as tracks of their own."""
     method, _, others, samples = views
@@ -350,7 +348,7 @@ def solve_pose_and_triangulate(
     *,
     seed: int | Tensor,
     fit: PoseFit | PosePrior | None,
-    clock: StageTimer,
+    clock: "StageTimer",
 ) -> tuple[Estimate, Tracks, PoseFit]:
     """Stages 5 and 6: triangulate tracks under the pose estimated from them, or under a given one.
 

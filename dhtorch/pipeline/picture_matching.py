@@ -1,7 +1,5 @@
 """Pictures of two collections -> which are the same picture, at any size, and which show the same place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 

@@ -12,8 +12,6 @@ Alphabet: maps (B, h, w); cells (B, rows, columns), N = rows · columns of them;
 depth (1/m), on a plane q = a u + b v + c of pixels (u, v), exactly.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Methods by name: that of the paper, and those with a most probable pose and abstention by the stated error."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

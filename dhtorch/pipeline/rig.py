@@ -3,8 +3,6 @@
 At every instant near returns fix that pose with a covariance; a rigid rig has one pose at all instants.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -8,8 +8,6 @@ A stage is any callable with the stage's signature: a function, a ``functools.pa
 tracker as its ``hint``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial

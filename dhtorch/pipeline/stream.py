@@ -4,8 +4,6 @@ push(frame) ─┬─ scene cut: past frames are dropped
              └─ past frames at a few steps ─ selection ─ method ─ Estimate of the newest
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 

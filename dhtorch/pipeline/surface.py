@@ -6,8 +6,6 @@ values then give the position between planes, each view weighted by its variance
 Alphabet: q inverse depth (1/m), as in :mod:`dhtorch.geometry.plane_sweep`.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch
@@ -159,7 +157,7 @@ def _joint_step(
     options: DenseOptions,
     *,
     last: bool = False,
-) -> tuple[Tensor, _ViewSums]:
+) -> "tuple[Tensor, _ViewSums]":
     """The step (B, h, w) at inverse depths ``at``, the weighted mean of the views' steps, and the sums over the views.
 
     Weights are inverse variances. The variance by the motions (``shared``) is computed only for the ``last`` step.

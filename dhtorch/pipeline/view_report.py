@@ -1,7 +1,5 @@
 """Report of view selection: the source views that a method selected for a reference view, and their gain."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Every candidate is solved as a pair for a few samples, on images of a few ten th
 fraction of the full estimate, and overlap, baseline and the existence of a pose are the same at full size.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

@@ -1,7 +1,5 @@
 """glibc malloc settings: freed memory stays in the process, instead of page faults for every batch."""
 
-from __future__ import annotations
-
 import os
 
 #: Environment variables with which a user configures glibc's allocator; it is then left unchanged.

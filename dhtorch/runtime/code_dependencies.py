@@ -4,8 +4,6 @@ A result stays valid while none of these files change: editing another experimen
 invalidate a running sweep, editing a stage does.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import importlib.util

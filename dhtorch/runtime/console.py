@@ -4,8 +4,6 @@ Verbosity: ``quiet`` (results and errors), ``normal``, ``verbose`` (log of input
 the environment variable ``_VERBOSITY_VARIABLE``, which a launcher's processes inherit.
 """
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import io

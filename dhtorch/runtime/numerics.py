@@ -6,8 +6,6 @@ The order in which torch sums depends on strides, and compiled operators read co
 channels-last images, would round differently.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from functools import wraps

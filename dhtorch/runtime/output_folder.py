@@ -9,8 +9,6 @@ cannot identify. Everything in the private folder is dhtorch's own.
 :mod:`dhtorch.runtime.storage` consults the open folder for every file that it writes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Worker processes end with their parent, also where the parent was killed."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

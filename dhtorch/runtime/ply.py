@@ -1,7 +1,5 @@
 """PLY files: the numbers of their vertices, read and written back."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A result holds the input (``experiment``, ``config``, ``data``), the output (``s
 ``key``, a hash of settings, code and data: a job with an equal key need not run again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib.metadata

@@ -5,8 +5,6 @@ Readers open every file with :func:`open_regular`, or read it whole with :func:`
 bombs.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

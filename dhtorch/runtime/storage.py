@@ -3,8 +3,6 @@
 Strict JSON is the subset that all JSON parsers read alike: no ``NaN``, no ``Infinity``, no duplicate keys in an object.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

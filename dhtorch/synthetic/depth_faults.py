@@ -5,8 +5,6 @@ Random faults draw from a seed on the CPU, the same for every map of a batch, so
 its batch mates.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ Alphabet: an *arm* is a chain of straight links of one width over the picture, f
 texture moves with it. It has a depth of its own in the sensor's map.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from random import Random

@@ -7,8 +7,6 @@ rest of the room looks the same with and without it.
 Alphabet: ``T_world_from_home`` (n) a motion of the world, one a frame; axes of the world as the room's, lengths in m.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

@@ -3,8 +3,6 @@
 It hides what is behind it in the pictures; a sensor has no return from it, or a false one far behind it.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor

@@ -6,8 +6,6 @@ of frames, and a long recording stays in the room by oscillating. Sines are take
 that poses do not depend on vector widths.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from random import Random

@@ -8,8 +8,6 @@ Only correctly rounded arithmetic and fixed summation orders are used, here and 
 on the number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -59,7 +57,7 @@ class Solid:
     shadow: bool = True
     faces: dict[int, Material] = field(default_factory=dict)
 
-    def moved(self, motion: Pose) -> Solid:
+    def moved(self, motion: Pose) -> "Solid":
         """The solid after a rigid motion (1) of the world."""
         turn, centre = torch.tensor(self.R, dtype=torch.float64), torch.tensor(self.centre, dtype=torch.float64)
         R, t = motion.R[0].double(), motion.t[0].double()

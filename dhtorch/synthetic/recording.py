@@ -5,8 +5,6 @@ model of a phone's LiDAR. Every frame is a function of the options and its index
 order of access, the process or the number of threads.
 """
 
-from __future__ import annotations
-
 import inspect
 import itertools
 from collections.abc import Sequence

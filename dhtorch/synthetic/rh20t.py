@@ -1,7 +1,5 @@
 """Writer of RH20T scenes: videos by camera, a calibration folder, and the robot's streams."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from fractions import Fraction

@@ -26,8 +26,6 @@ Alphabet: ``d`` (m) z-depth from the camera, at the middle of the look, to the n
 world as the room's: x right, y down, z forward; of the camera the same.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Sequence
@@ -223,7 +221,7 @@ class _Step:
     base_yaw: float  # degrees, from the heading of the camera
 
     @staticmethod
-    def of(task: int, scene: int, seed: int) -> _Step:
+    def of(task: int, scene: int, seed: int) -> "_Step":
         """The step of a task, which determines the target's looks, and a scene, which determines the rest."""
         of_task = Random(f"robot {seed} {task}")
         draw = Random(f"robot {seed} {task} {scene}")

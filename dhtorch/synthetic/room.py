@@ -10,8 +10,6 @@ Surfaces that face the viewer have texture at several scales, where window-based
 plain boards are white. That near surfaces are easy to track is a property of this room, not of rooms in general.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from random import Random

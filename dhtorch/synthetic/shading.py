@@ -8,8 +8,6 @@ Colours are display values, roughly square roots of light: multiplying them mult
 Alphabet: as in :mod:`dhtorch.synthetic.raycast`; L nodes, P rays.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence
@@ -47,7 +45,7 @@ class ShadedRoom:
         self._pictures = _Pictures(paint_textures(self._names, torch.Generator().manual_seed(seed)))
         self._furnish(solids, None)
 
-    def _furnish(self, solids: Sequence[Solid], lit: _Lightmap | None) -> None:
+    def _furnish(self, solids: Sequence[Solid], lit: "_Lightmap | None") -> None:
         """Set the solids and compute their light; the first ones keep the light ``lit``."""
         surfaces = _face_materials(solids)
         self.solids = Solids(solids)
@@ -73,7 +71,7 @@ class ShadedRoom:
         self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA_WEIGHTS)).sum(-1)
         self.light = _Lightmap(self.solids, self._lights, self._ambient, lit)
 
-    def joined_by(self, guests: Sequence[Solid]) -> ShadedRoom:
+    def joined_by(self, guests: Sequence[Solid]) -> "ShadedRoom":
         """The room with further solids, lit where they stand; the light of the room itself is unchanged.
 
         Raises:
@@ -89,7 +87,7 @@ class ShadedRoom:
         room._furnish([*self.solids.each, *guests], self.light)
         return room
 
-    def moved(self, motion: Pose) -> ShadedRoom:
+    def moved(self, motion: Pose) -> "ShadedRoom":
         """The room with its ``SURFACE_MOVING`` solids after rigid motions (n) of the world, in unchanged light.
 
         The k-th of them has the motion k mod n. A surface point keeps its colour, so that it can be tracked like any
@@ -105,7 +103,7 @@ class ShadedRoom:
         room.solids = Solids(solids)
         return room
 
-    def relit(self, factors: Sequence[float], ambient: float) -> ShadedRoom:
+    def relit(self, factors: Sequence[float], ambient: float) -> "ShadedRoom":
         """The room with the power of its lights times ``factors``, and another ambient light.
 
         Raises:
@@ -222,7 +220,7 @@ class _Lightmap:
         solids: Solids,
         lights: Sequence[Light],
         ambient: float,
-        existing: _Lightmap | None = None,
+        existing: "_Lightmap | None" = None,
         *,
         spacing: float = 0.1,
     ):

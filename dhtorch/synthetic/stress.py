@@ -6,8 +6,6 @@ jumps and motion blur.
 Recordings are named ``stress_<name>``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

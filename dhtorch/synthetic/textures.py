@@ -8,8 +8,6 @@ Alphabet: ``u`` right and ``v`` down, in [0, 1) over the tile. Only correctly ro
 logarithm): the result does not depend on the number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -7,8 +7,6 @@ and the image shows nothing behind it, its background is filled in from the visi
 there. Blending is in linear light: display values are squared first.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A two-camera rig in the built-in room, with exact relative pose and depth."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Independent views of the built-in room from random positions and directions, one frame each."""
 
-from __future__ import annotations
-
 from random import Random
 
 import torch

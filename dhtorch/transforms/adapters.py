@@ -8,8 +8,6 @@ directly, before any crop: a crop would not adapt the intrinsics. kornia's conta
 :class:`dhtorch.transforms.kornia.AugmentSample`.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import sys

@@ -1,7 +1,5 @@
 """Sample dict → the same dict plus far depth: the whole method as a transform for data loaders."""
 
-from __future__ import annotations
-
 import copy
 import warnings
 from collections.abc import Mapping
@@ -48,7 +46,7 @@ class _ProblemCounts:
         for number in problem.tolist():
             counts[number] += 1
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> _ProblemCounts:
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_ProblemCounts":
         clone = copy.copy(self)
         clone.counts = self.counts.clone().share_memory_()
         return clone
@@ -155,7 +153,7 @@ class ExtendDepth(torch.nn.Module):
         keys = ", ".join(map(str, self.views.keys()))
         return f"ExtendDepth({self.method!r}{dense}; reads {keys}; adds {self.prefix}*)"
 
-    def with_options(self, *, batched: bool) -> ExtendDepth:
+    def with_options(self, *, batched: bool) -> "ExtendDepth":
         """The same transform for batches or for single samples; networks and counts of problems are shared.
 
         Raises:

@@ -9,8 +9,6 @@ Alphabet: ``A`` (B, 3, 3) takes a pixel of the picture to its pixel in the augme
 :func:`dhtorch.geometry.camera.warp`); ``W`` (B, 3, 3) is the mirror of the world where Q mirrors, else the identity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -143,7 +141,7 @@ class AugmentSample(torch.nn.Module):
         moved = container(others, params=ours)
         return sample | (moved if self.batched else {key: x[0] for key, x in moved.items()})
 
-    def _run(self, container: ImageSequential, params: list[ParamItem], state: _Augmented) -> None:
+    def _run(self, container: ImageSequential, params: list[ParamItem], state: "_Augmented") -> None:
         """Run the children of a container that its parameters name, in their order."""
         for param in params:
             module = container.get_submodule(param.name)

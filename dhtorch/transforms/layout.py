@@ -4,8 +4,6 @@ A flagged sample must collate with good ones: what is missing or of another shap
 and so do values with numbers that are not finite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

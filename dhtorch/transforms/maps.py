@@ -1,7 +1,5 @@
 """Dense depth maps of samples, computed by :func:`dhtorch.pipeline.completion.complete_depth`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +24,7 @@ class DenseMaps:
     calibration: Calibration = field(default_factory=default_calibration)
 
     @classmethod
-    def from_options(cls, setting: bool | Mapping[str, Any], name: str = "dense") -> DenseMaps | None:
+    def from_options(cls, setting: bool | Mapping[str, Any], name: str = "dense") -> "DenseMaps | None":
         """Option ``dense`` -> maps, None if it is off; see :func:`dhtorch.pipeline.dense.dense_options`."""
         options = dense.dense_options(setting, name)
         return None if options is None else cls(options)

@@ -3,8 +3,6 @@
 Alphabet: B samples, T frames of a sample along time.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import Any

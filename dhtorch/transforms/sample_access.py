@@ -3,8 +3,6 @@
 Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 

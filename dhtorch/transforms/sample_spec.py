@@ -7,8 +7,6 @@ a unit is an error, and so are values that contradict the options.
 Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -92,10 +90,10 @@ class SampleSpec:
     depth: str = "depth"  # key of the reference view's depth map
     intrinsics: KeyOrCamera = "intrinsics"  # 3×3, 4×4, fx fy cx cy, or a camera of kornia, px of the image
     distortion: KeyOrNumbers | None = None  # of the image, in OpenCV's order
-    depth_intrinsics: KeyOrCamera | None = None  # px of the depth map; None = it covers the same field as the image
+    depth_intrinsics: "KeyOrCamera | None" = None  # px of the depth map; None = it covers the same field as the image
     confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
     other_image: str | None = None  # key of the source view's image; None = another frame along time
-    other_intrinsics: KeyOrCamera | None = None  # None = those of the reference view
+    other_intrinsics: "KeyOrCamera | None" = None  # None = those of the reference view
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # index of the reference view along time
     other_at: int | Sequence[int] = 0  # index of the source view; several are for a multi-view method

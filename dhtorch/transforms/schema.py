@@ -7,8 +7,6 @@ the documentation are derived from it.
 Alphabet: B samples; of each N points, P patches of its token grid, H × W pixels of its dense map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter as _of

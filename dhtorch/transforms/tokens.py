@@ -3,8 +3,6 @@
 Alphabet: B images, N samples, P = rows × columns of patches, row by row, as in ViT and DINOv2.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

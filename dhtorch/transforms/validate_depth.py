@@ -1,7 +1,5 @@
 """Sample dict → the same dict plus a validation of its depth map: a transform for data loaders."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

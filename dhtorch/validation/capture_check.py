@@ -6,8 +6,6 @@ surfaces seen from two frames for the stated poses (:mod:`dhtorch.validation.pos
 sentence and the option that corrects it. Refuted poses are removed from the recording, so that no command uses them.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ under which edges coincide clearly better is the finding. Unlike tracks against 
 works where motion is too large to be tracked.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import Final, NamedTuple
@@ -166,7 +164,7 @@ class _ReducedFrames(NamedTuple):
     covered: Sequence[Tensor]  # (1, h, w) 1 where it has values, else 0
 
     @classmethod
-    def of(cls, frames: Sequence[Frame]) -> _ReducedFrames | None:
+    def of(cls, frames: Sequence[Frame]) -> "_ReducedFrames | None":
         """Six of them (about a second), evenly spread, each once; None of fewer than three, which decide wrongly."""
         places = [round(k * (len(frames) - 1) / 5) for k in range(6)] if frames else []
         chosen = list({id(frames[place]): frames[place] for place in places}.values())

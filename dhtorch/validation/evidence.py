@@ -11,8 +11,6 @@ By default a pixel has no evidence: a kind of evidence supports a pixel only whe
 20 %.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -10,8 +10,6 @@ Alphabet: P pairs of a window of frames, N samples; a *miss* is the distance of 
 point, in pixels of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c²), between 0 and 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -171,7 +169,7 @@ def diagnose(
     *,
     method: Method = TRACKING_METHOD,
     seed: int = 0,
-    watched: WindowTracks | None = None,
+    watched: "WindowTracks | None" = None,
     options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> Diagnosis:
     """Window of frames and their maps -> the known fault that they share, if one explains the pictures clearly best.
@@ -217,7 +215,7 @@ def _diagnose_by_tracks(
     maps: Sequence[Tensor] | None,
     method: Method,
     seed: int,
-    watched: WindowTracks,
+    watched: "WindowTracks",
     options: ValidationOptions,
 ) -> Diagnosis:
     """Diagnosis by the motion of points between pictures."""

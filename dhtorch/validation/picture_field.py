@@ -7,8 +7,6 @@ of its track: the camera with the least loss is that of the pictures.
 Alphabet: H cameras that are tried, N near returns of all pairs.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple

@@ -12,8 +12,6 @@ Alphabet: K pairs of frames, H readings; the *disagreement* of a pair is the med
 that meet a return, where z is the depth of a moved return and z' that of the frame there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ sensor's own, a wrong scale is common to the map and to all references, and only
 (``T_world_from_cam``) can detect it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -9,8 +9,6 @@ at least ``side_ratio``; the *rival* of a pixel near an outline is the depth of 
 the pixel.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

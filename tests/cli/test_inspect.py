@@ -1,7 +1,5 @@
 """``dhtorch inspect``: its report on written captures, its warnings, and that it accepts real ones."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

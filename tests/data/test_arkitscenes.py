@@ -1,7 +1,5 @@
 """ARKitScenes: captures written with its layout and clocks and read back, and damaged ones."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import pickle

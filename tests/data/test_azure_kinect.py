@@ -1,7 +1,5 @@
 """Azure Kinect videos: written with and without the factory's calibration, and read back."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """CA-1M archives, and the tar and TIFF decoding below them."""
 
-from __future__ import annotations
-
 import io
 import math
 import tarfile

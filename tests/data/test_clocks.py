@@ -1,7 +1,5 @@
 """Films beside rows of tables: pairing by stamps and places, and rates that are not plausible."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Decoders of LZFSE, OpenEXR and video: what they give back, and that damage never reaches further than an error."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import multiprocessing

@@ -1,7 +1,5 @@
 """Files of a few kilobytes that ask for gigabytes or minutes, and files that are none: refused before either is spent."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Files and folders that no reader recognises: how each is described, and the remedy that is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Image folders of other people's tools: written from each format's description, edited, read back or refused."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path

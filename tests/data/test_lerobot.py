@@ -1,7 +1,5 @@
 """LeRobot data sets, v3 and v2.1: written with known geometry, read back, and damaged."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

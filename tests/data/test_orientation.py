@@ -1,7 +1,5 @@
 """Orientation of depth and pictures: symmetries and their scores, what files state, and recordings made consistent."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pickled .npy files: plain data comes back as it was, anything else is refused and nothing in it runs."""
 
-from __future__ import annotations
-
 import pickle
 import pickletools
 import struct

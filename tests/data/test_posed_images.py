@@ -1,7 +1,5 @@
 """Exports with a camera for every image (nerfstudio and its relatives, Polycam): written with known geometry, read."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Readers against scenes of exact geometry, against the real pieces, and against damaged files."""
 
-from __future__ import annotations
-
 import io
 import math
 import pickle

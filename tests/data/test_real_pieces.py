@@ -1,7 +1,5 @@
 """The readers on the real pieces: points seen twice coincide in the world, and wrong poses would show."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Record3D: its three layouts written from a known room and read back, a real one, live frames, and damaged ones."""
 
-from __future__ import annotations
-
 import colorsys
 import json
 import math

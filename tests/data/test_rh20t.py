@@ -1,7 +1,5 @@
 """RH20T scenes: written with known geometry, read back, and damaged."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

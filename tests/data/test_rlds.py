@@ -1,7 +1,5 @@
 """RLDS data sets in TFRecord files: written with known geometry and read back, real ones, and damaged ones."""
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Robots' recordings: bags of every storage written by the library rosbags and read back; damaged and odd ones."""
 
-from __future__ import annotations
-
 import bz2
 import sqlite3
 from collections.abc import Sequence

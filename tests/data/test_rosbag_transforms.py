@@ -1,7 +1,5 @@
 """Coordinate frames of a bag: poses along a chain of fixed and moving transforms, and when there is no answer."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

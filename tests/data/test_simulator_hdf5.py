@@ -1,7 +1,5 @@
 """Simulators' demonstrations in HDF5: every layout written and read back; links and damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stray Scanner: captures of a known room written and read back, a real one, and damaged ones."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

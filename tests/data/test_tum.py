@@ -1,7 +1,5 @@
 """TUM RGB-D: sequences written in its layout, with the traps of its clocks and of its trajectories."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

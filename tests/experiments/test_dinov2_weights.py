@@ -1,7 +1,5 @@
 """DINOv2 weights: every published layout gives the network that a plain forward pass of the official one describes."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

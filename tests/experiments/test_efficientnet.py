@@ -1,7 +1,5 @@
 """EfficientNet-Lite0: its network against modules of torch, and its package's weights against their own statistics."""
 
-from __future__ import annotations
-
 from functools import partial
 from types import SimpleNamespace
 

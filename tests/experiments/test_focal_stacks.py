@@ -1,7 +1,5 @@
 """Focal stacks: every format written and read back, refocused light fields, damaged files, real stacks."""
 
-from __future__ import annotations
-
 import math
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Probes: errors of groups not seen, features of frames, and both experiments on small data."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools

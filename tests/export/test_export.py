@@ -1,7 +1,5 @@
 """Files for other programs, read back by other programs (plyfile, trimesh) and by plain parsers: every number, in its place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

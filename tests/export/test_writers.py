@@ -1,7 +1,5 @@
 """Every writer writes the same bytes however its tensors lie in memory: expanded, transposed, backwards."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The COLMAP workspace of a map: what it leaves out where the written poses contradict the tracks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The demo page: an uploaded capture gives a picture and a page, a hostile archive and an unreadable capture one line."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import tempfile

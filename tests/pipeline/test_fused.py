@@ -1,7 +1,5 @@
 """Sparse and swept answers joined: the rules on single answers, and the product on the built-in room."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Several cameras at one instant: rigs as recordings, their pairs, one pose for all instants."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from pathlib import Path

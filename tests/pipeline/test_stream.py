@@ -1,7 +1,5 @@
 """Frame after frame: the newest from the past alone, with a bounded memory, whatever the way the frames came."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

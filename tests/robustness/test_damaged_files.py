@@ -1,7 +1,5 @@
 """Damaged captures of every format are valid data or a FormatError; the harness finds readers that misbehave."""
 
-from __future__ import annotations
-
 import itertools
 import mmap
 import os

@@ -1,7 +1,5 @@
 """Outputs that are incomplete, damaged, foreign or of an earlier run: what the next run of a command makes of them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -4,8 +4,6 @@ The frames are those of ``support.known_episodes``, of which no two share a numb
 Pillow, json and struct, never with dhtorch's own readers.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Frames of a smooth walk inside the box, with confidence, as ARKitScenes and CA-1M captures hold them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

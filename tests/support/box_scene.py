@@ -1,7 +1,5 @@
 """Frames of a box seen from inside, with exact depth and pose, for the tests of the readers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

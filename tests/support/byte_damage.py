@@ -3,8 +3,6 @@
 A capture is ``{relative path: bytes}``. Every choice is drawn from the given generator: a seed repeats a mutant.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

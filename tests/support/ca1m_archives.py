@@ -1,7 +1,5 @@
 """CA-1M archives of a walk inside the box: pictures, depth of another camera, and laser depth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows of captures: written with known frames, edited, and read as the frames or refused with one sentence."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import re

@@ -1,7 +1,5 @@
 """Small captures of every format that is read: how to write one below a folder, and how to open and read all of it."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 from collections.abc import Callable

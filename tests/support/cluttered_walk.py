@@ -1,7 +1,5 @@
 """A quick walk past boards that stand in a textured room: exact depth with many steps, which move in the picture."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

@@ -9,8 +9,6 @@ capture, code executed.
 The damage is that of ``byte_damage``; the number of a mutant determines it: ``attack(..., only=17)`` repeats mutant 17.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import io

@@ -1,7 +1,5 @@
 """Random focal stacks with depth, and exact light fields of a smooth texture."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@
 readers decode it. Every choice is drawn from the given generator.
 """
 
-from __future__ import annotations
-
 import io
 import random
 import struct

@@ -8,8 +8,6 @@ killed with SIGKILL right before it into FOLDER/<moment>, and another one finish
 may grow beyond 2 kB, and then one may. Prints a line of JSON.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

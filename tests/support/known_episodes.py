@@ -4,8 +4,6 @@ No number is the same for two frames, cameras or episodes, so that a value of an
 longer than the rows of one table in memory.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

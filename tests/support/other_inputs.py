@@ -4,8 +4,6 @@ As in ``captures_by_format``: how to write one below a folder, and how to read a
 FormatError count as one where they are one line that names the file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import shutil

@@ -1,7 +1,5 @@
 """A value of every kind that a pickled ``.npy`` file may hold."""
 
-from __future__ import annotations
-
 import collections
 from typing import Any
 

@@ -4,8 +4,6 @@ Operations that mix devices raise as on a device; those for which the host waits
 values) are recorded with the lines that called them. Rounding, speed and memory are the CPU's.
 """
 
-from __future__ import annotations
-
 import traceback
 from collections import Counter
 from contextlib import nullcontext
@@ -49,7 +47,7 @@ class OnDevice(Tensor):
     held: Tensor
 
     @staticmethod
-    def __new__(cls, held: Tensor) -> OnDevice:
+    def __new__(cls, held: Tensor) -> "OnDevice":
         x = Tensor._make_wrapper_subclass(
             cls,
             held.size(),

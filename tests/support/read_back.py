@@ -1,7 +1,5 @@
 """Files of points, meshes and models as other programs read them: by plyfile, json and struct alone."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Record3D captures of a walk inside the box: its frames, an ``.r3d`` archive and an RGBD video."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

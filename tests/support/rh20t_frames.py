@@ -1,7 +1,5 @@
 """Frames of an RH20T scene inside the box: a fixed camera, a camera on the hand, the pose of the robot's base."""
 
-from __future__ import annotations
-
 import torch
 
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS

@@ -1,7 +1,5 @@
 """Episodes of frames inside the box, as LeRobot and RLDS data sets hold them."""
 
-from __future__ import annotations
-
 from dhtorch.records import Frame
 from support.box_scene import CAMERA, HW, pose, render
 

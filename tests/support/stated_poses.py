@@ -1,7 +1,5 @@
 """Poses as files of other conventions state them, from the true poses."""
 
-from __future__ import annotations
-
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Frames of a walk inside the box as in Stray Scanner captures: 60 Hz, small depth maps, a camera per frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

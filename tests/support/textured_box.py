@@ -1,7 +1,5 @@
 """Frames of the box of ``box_scene.py`` with a texture that can be tracked; fast to render."""
 
-from __future__ import annotations
-
 import torch
 
 from dhtorch.geometry import se3

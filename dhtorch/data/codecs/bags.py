@@ -8,8 +8,6 @@ A database is opened for reading alone and as immutable: nothing is written besi
 plain tables are read; a view or a virtual table, whose definition would be executed, is refused.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import sqlite3

@@ -4,8 +4,6 @@ Poses map world to camera, quaternions start with w, and the centre of the first
 (0, 0) here. Every pose and point remembers where the file holds it, so that a model can be written with other ones.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The header is read first, so that the size is checked before pixels are decoded.
 cameras write them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 from pathlib import Path

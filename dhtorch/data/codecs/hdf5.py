@@ -4,8 +4,6 @@ Shape, type and storage of an array are checked first. References out of the fil
 storage, virtual arrays) and filters that need a plug-in are refused.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ A stream is a sequence of blocks, each starting with its type and unpacked size,
 checked before decoding, so that truncated streams, or streams of another size, do not reach the decoder.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The header is a Python expression, and numpy's parser of it is not written for d
 ``FormatError`` here. An array's declared size is compared with its bytes.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import struct

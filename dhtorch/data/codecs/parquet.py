@@ -4,8 +4,6 @@ The footer is checked before it reaches the decoder, and every column chunk befo
 headers must add up to the footer's and stay below a limit, so that a page cannot unpack into gigabytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path

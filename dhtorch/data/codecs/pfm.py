@@ -1,7 +1,5 @@
 """Codec of portable float maps (PFM): three lines of text, then float32 values, last row first."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Codec of 16-bit portable grey maps (PGM), used for depth by some tools: text header, big-endian codes."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -6,8 +6,6 @@ and *call* accepts only the few tokens that rebuild arrays, implemented here. No
 limited to the available bytes. Protocols 2 to 5, module paths of numpy 1 and 2.
 """
 
-from __future__ import annotations
-
 import gc
 import math
 import re

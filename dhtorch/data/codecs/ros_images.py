@@ -1,7 +1,5 @@
 """Codec of the pixels of ROS pictures: colour, depth, compressed depth, and the lens models of their calibration."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any, Final

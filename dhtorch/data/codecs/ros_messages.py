@@ -4,8 +4,6 @@ Definitions are fixed here and never taken from a file; rosbags compares the len
 bytes of the message. A definition may be the beginning of a message's: what follows is not read.
 """
 
-from __future__ import annotations
-
 import struct
 from functools import cache
 from pathlib import Path

@@ -5,8 +5,6 @@ The index is made in one pass over the headers; a damaged header, or a member th
 than regular files (folders, links, devices) are skipped.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

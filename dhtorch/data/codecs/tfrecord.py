@@ -7,8 +7,6 @@ CRC-32C (Castagnoli), *masked*: rotated right by 15 bits, plus a constant. A mes
 Alphabet: a span is (offset, length) of bytes in the file.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator, Sequence

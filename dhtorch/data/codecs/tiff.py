@@ -4,8 +4,6 @@ tifffile reads the directory; size, type and the position of every strip are com
 them.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator, Sequence

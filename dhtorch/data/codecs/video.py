@@ -12,8 +12,6 @@ The samples that an mp4 declares are counted before FFmpeg allocates memory for 
 number of samples, all of one size, runs of one duration, fragments of defaults.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """Check of a zip archive's directory size, from its end record, before the directory is read into memory."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import BinaryIO

@@ -6,8 +6,6 @@ file, the field, what was found and what was expected. Files are opened by :mod:
 Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

@@ -1,7 +1,5 @@
 """Reconstructions up to scale: read as cameras with points or depth, written in metres in the same format."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """COLMAP's model as a reconstruction up to scale: its views with their observed points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras and maps of networks in npz archives as a reconstruction up to scale."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A reconstruction up to scale: views (picture, camera, pose, depth map or observed points) and points."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

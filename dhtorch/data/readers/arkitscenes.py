@@ -10,8 +10,6 @@ The three downloads of one capture (``raw``, ``3dod``, ``upsampling``) complemen
 are taken from the same capture's folder in the other two, where these lie beside each other as downloaded.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ Without it K has to be set, and the depth must have the colour's size: it is the
 Frames are colour and depth maps stamped within half a period of one another, at the colour's stamps; there is no pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -10,8 +10,6 @@ boxes (``instances``) are not read: no stage needs them. Extensions are ignored;
 content.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import partial

@@ -7,8 +7,6 @@ to scale: unless they were aligned they are not metric, which the report states.
 metres (``# metres``) with their images, and the times of these in ``times.txt``.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

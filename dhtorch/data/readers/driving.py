@@ -9,8 +9,6 @@ by the image's: sparse, z-buffered, nothing filled in. Objects that moved betwee
 motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime

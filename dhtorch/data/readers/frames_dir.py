@@ -14,8 +14,6 @@ with a value for each image) is read where present; options
 override it, and it overrides the intrinsics file.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ decodes a row on access. :func:`open_numbered` opens rows that share one camera 
 rows of exports that list every image with a camera of its own. Depth files are PNGs or PGMs of 16 bits, TIFFs or NPYs.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

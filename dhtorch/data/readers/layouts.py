@@ -45,8 +45,6 @@ map are), ``units_per_metre`` (open3d: of the depth codes; None = ``depth_scale`
 assumed) and ``trajectory`` (open3d: file with the poses; None = the first by name that has a pose of each frame).
 """
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import math

@@ -9,8 +9,6 @@ The format has no place for intrinsics and poses. K comes from option ``K``, els
 videos have no code for *no return*, see :mod:`dhtorch.data.depth_codes`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

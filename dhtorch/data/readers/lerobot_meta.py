@@ -1,7 +1,5 @@
 """Metadata of LeRobot data sets: features, episodes, and the files with an episode's rows and videos."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence

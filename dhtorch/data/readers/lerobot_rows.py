@@ -4,8 +4,6 @@ A depth video holds 12-bit codes (:mod:`dhtorch.data.depth_codes`). A video of m
 steps of a unit, as images and arrays do.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -13,8 +13,6 @@ The unit of depth is ``depth_unit_scale_factor`` or ``integer_depth_scale``, met
 (NeRFCapture: its range in m / 65535). Where neither is present, nerfstudio assumes millimetres.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -7,8 +7,6 @@ axes (y up, z backward); NAME is a time stamp in microseconds and shared by ``im
 export has both. ``mesh_info.json`` and ``raw.glb`` describe the mesh, in axes of its own, and are not needed.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -19,8 +19,6 @@ the end of the file, behind the images, or in a ``metadata.json`` beside it; the
 confidence and no pose.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

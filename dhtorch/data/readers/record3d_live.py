@@ -5,8 +5,6 @@ is therefore copied inside the callback. A few frames are queued between the two
 the phone the oldest frame is dropped, so that frames are recent and memory is bounded.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -13,8 +13,6 @@
 Depth is ``f · baseline / (disparity + doffs)`` with ``doffs`` the difference of the principal points.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

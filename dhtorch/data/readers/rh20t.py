@@ -11,8 +11,6 @@ robot's data. Scenes named ``…_human`` show a person at the same task; which a
 videos, time stamps and the calibration are required of a scene.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Alphabet: ``E`` world → camera (the world is the calibration marker); ``T`` to
 tcp → camera, constant for a camera on the hand. Poses in files are x y z qw qx qy qz, metres, scalar first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

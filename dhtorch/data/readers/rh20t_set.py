@@ -1,7 +1,5 @@
 """Reader of RH20T sets: one recording per scene, from the camera on the robot's hand."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from functools import partial

@@ -9,8 +9,6 @@ features where a set has them; without them 16-bit depth images are in mm and ar
 cameras give no depth (NO_BASELINE).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

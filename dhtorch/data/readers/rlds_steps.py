@@ -4,8 +4,6 @@ Values are read for a range of steps at a time, as they are stored. Features wit
 encoded bytes, cannot be decoded and are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -38,7 +36,7 @@ class EpisodeSteps:
     numbers: dict[str, np.ndarray] = field(default_factory=dict)  # cache of features that must be decoded whole
 
     @classmethod
-    def of(cls, recording: Recording) -> EpisodeSteps:
+    def of(cls, recording: Recording) -> "EpisodeSteps":
         """The steps of a recording's episode.
 
         Raises:

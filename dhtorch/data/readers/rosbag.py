@@ -12,8 +12,6 @@ intrinsics. Depth and colour are paired by their stamps within half a period. Po
 the root of its chain of ``/tf``, where something of that chain moves. Pixels are decoded on access.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Index of a robot's recording: the topics of images, their stamps and places, calibrations, cameras and transforms."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Tree of coordinate frames of a robot's recording: fixed transforms, and poses along a moving chain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

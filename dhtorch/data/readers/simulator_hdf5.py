@@ -14,8 +14,6 @@ Depth of a z-buffer, none of whose values exceeds 1, is converted where the plan
 ``clip_planes``: z = near / (1 - d (1 - near / far)), as MuJoCo's.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -13,8 +13,6 @@ have a frame, whatever its rate (:func:`dhtorch.data.clocks.pair_film`). If not,
 show clearly that the first or the last frames were lost; else an option must decide.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

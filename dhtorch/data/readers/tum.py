@@ -12,8 +12,6 @@
   1/5000 m is assumed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A network's input is a resized and cropped image, and its unit of depth is arbit
 transform from image pixels to its pixels, and becomes an :class:`Estimate` only with a scale from another source.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any
@@ -47,7 +45,7 @@ class _PairNetwork:
         return Path(weights)
 
     @torch.no_grad()
-    def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
+    def __call__(self, frame_0: Frame, frame_1: Frame) -> "RelativeDepth":
         """Depth of view 0 from B pairs; the frames' own depth is not used."""
         (view_0, gain, shift), (view_1, _, _) = (
             resize_and_crop(f.image, *self._sizes(*f.hw)) for f in (frame_0, frame_1)
@@ -89,7 +87,7 @@ class VGGT(_PairNetwork):
         self.network: torch.nn.Module = network.to(device).eval()
         self.width, self.device = width, device
 
-    def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
+    def __call__(self, frame_0: Frame, frame_1: Frame) -> "RelativeDepth":
         """Depth of view 0 from B pairs of views of one size; the frames' own depth is not used."""
         if frame_0.hw != frame_1.hw:
             raise ValueError(f"VGGT: views of {frame_0.hw} and {frame_1.hw} pixels, expected the same size")

@@ -8,8 +8,6 @@ Alphabet: a *cell* is a square of 8×8 pixels of the network's input image; ``D`
 length at the centres of the cells; ``S`` (M, h, w) their scalar products with the descriptors of M points.
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -74,7 +72,7 @@ def method_missing_reason(method: Method) -> str | None:
 
 
 @cache
-def load_xfeat(device: str = "cpu") -> XFeat:
+def load_xfeat(device: str = "cpu") -> "XFeat":
     """kornia's XFeat with the weights of the package, in evaluation mode.
 
     Raises:

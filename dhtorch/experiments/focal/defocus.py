@@ -14,8 +14,6 @@ half of it (paper: 0.06).
 What would refute it: |rho| above 0.5, r with the oracle's side below 0.4, or a deployable r of half the oracle's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -208,7 +206,7 @@ def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int
 
 
 def _measure_through_lens(
-    frame: Frame, sites: _Sites, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
+    frame: Frame, sites: "_Sites", lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
 ) -> dict[str, Row]:
     """Variant → row of one image, rendered with the focus on the depth at its centre."""
     depth, (h, w) = frame.depth, frame.hw

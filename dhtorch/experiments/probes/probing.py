@@ -10,8 +10,6 @@ method's (it must beat the context on groups not trained on, or depth tells noth
 the depth features of another group (it must not beat the context, or the split leaks). No verdict without them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -226,7 +224,7 @@ class ProbeShards:
             start += width
         return torch.cat([columns[name] for name in blocks])
 
-    def __enter__(self) -> ProbeShards:
+    def __enter__(self) -> "ProbeShards":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -8,8 +8,6 @@ Those shipped with the package are loaded by name:
     score = functools.partial(rank_by_error, recalibration=calibration.probability)
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Scenes with ground truth -> a calibration of scores and sigmas."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -4,8 +4,6 @@
 ``maps`` the maps of a view or of some frames; ``markup`` writes pages. matplotlib is imported on first use.
 """
 
-from __future__ import annotations
-
 from dhtorch.viz.plots.colours import Stroke, assign_strokes
 from dhtorch.viz.plots.figures import (
     add_legend,

@@ -7,8 +7,6 @@ Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); tho
 on light and on dark ground alike. Only what belongs to a page, as its ink and ground, has a counterpart in the dark.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 

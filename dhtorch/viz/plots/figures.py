@@ -4,8 +4,6 @@ matplotlib is imported on first use, and only its figure objects are used: no gl
 changes.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import io

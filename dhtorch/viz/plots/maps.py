@@ -3,8 +3,6 @@
 Arrays may be torch tensors or numpy arrays, on any device, of one view (no batch dimension).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple

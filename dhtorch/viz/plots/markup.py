@@ -4,8 +4,6 @@ The document has light and dark colours and the style of text, tables and figure
 loads no external files.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import re

@@ -1,7 +1,5 @@
 """matplotlib settings for notebook figures: width of a printed page, print resolution, font size of the text."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

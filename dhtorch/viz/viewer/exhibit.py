@@ -4,8 +4,6 @@ All arrays are numpy, in metres and pixels of the full image, so that a page, a 
 them without torch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

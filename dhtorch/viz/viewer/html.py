@@ -4,8 +4,6 @@ The page draws with WebGL and 2D canvases, in plain JavaScript stored beside thi
 Names from files are untrusted: they are embedded as JSON text with markup characters escaped, and shown as text.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """PLY file -> exhibit with points only, e.g. for a result whose data are missing."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

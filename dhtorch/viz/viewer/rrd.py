@@ -4,8 +4,6 @@ All entities are below ``world`` in metres, on two timelines: ``pair``, a counte
 view. ``gates`` holds the counts of every pair as numbers, ``pair`` as text.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 The page is self-contained. Names from files are untrusted and escaped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

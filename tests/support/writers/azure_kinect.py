@@ -1,7 +1,5 @@
 """Test writer of Azure Kinect recordings."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Table of test writers with one signature: the same frames as a small capture of every layout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

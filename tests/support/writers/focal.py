@@ -1,7 +1,5 @@
 """Writers of focal stacks for tests: FoD500, DDFF-12 (HDF5 and raw light fields), a plain folder of images."""
 
-from __future__ import annotations
-
 import io
 import struct
 from collections.abc import Mapping, Sequence

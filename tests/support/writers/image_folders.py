@@ -1,7 +1,5 @@
 """Test writers of image folders: dhtorch's own and other people's layouts, and exports with a camera for every image."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Test writer of LeRobot data sets: v3 with shared tables and videos, v2.1 with files per episode."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

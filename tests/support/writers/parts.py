@@ -1,7 +1,5 @@
 """Parts of test writers: files of images, rows of numbers, and films."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

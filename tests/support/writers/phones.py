@@ -3,8 +3,6 @@
 The frames' world has y down, as the built-in scenes; Record3D's is written with y up, as ARKit has it.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

@@ -1,7 +1,5 @@
 """Test writer of RLDS data sets: TFRecord files with TFDS's two JSON files."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

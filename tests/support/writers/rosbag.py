@@ -1,7 +1,5 @@
 """Test writer of robots' recordings: MCAP and SQLite of ROS 2, and ROS 1 bags, by the library rosbags."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +52,7 @@ def write_rosbag(
     frames: Sequence[Frame],
     layout: BagLayout | None = None,
     *,
-    begin: Callable[[BagWriter], None] | None = None,
+    begin: "Callable[[BagWriter], None] | None" = None,
 ) -> None:
     """Write frames as messages; ``path`` is a folder, or a ``.bag`` file for ``ros1``.
 

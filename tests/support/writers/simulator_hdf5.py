@@ -1,7 +1,5 @@
 """Test writer of simulators' demonstrations in HDF5: robomimic and ManiSkill."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
