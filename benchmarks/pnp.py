@@ -1,17 +1,18 @@
-"""Time per pair of the metric pose from near points, against OpenCV and PoseLib, and how well all find it.
+"""Time per pair of the metric pose from near points, against OpenCV, PoseLib and pycolmap, and how well all find it.
 
     python benchmarks/pnp.py --json benchmarks/results/pnp.json
 
 Random scenes: points 0.5 to 2.5 m away seen by a 640x480 camera, pixels with 0.5 px of noise, a share of them replaced
 by any other pixel. Ours is stage 5 of ``paper`` with 64 hypotheses, enough for half the points being wrong. Peers, pair
-after pair: ``cv2.solvePnPRansac`` with AP3P, followed by ``cv2.solvePnPRefineLM`` on the inliers; PoseLib with at
-least 100 iterations (its default of 1000 would be no fair peer). Mode ``compiled`` is the stage with the compiled code
-of ``python -m dhtorch.ops``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to be
-learned.
+after pair: ``cv2.solvePnPRansac`` with AP3P and with USAC MAGSAC, both followed by ``cv2.solvePnPRefineLM`` on the
+inliers; PoseLib with at least 100 iterations (its default of 1000 would be no fair peer); pycolmap where it is
+installed. Mode ``compiled`` is the stage with the compiled code of ``python -m dhtorch.ops``. Ours runs under
+``torch.inference_mode``, as one would run it where nothing is to be learned.
 
 Errors: median rotation error in degrees over a hundred pairs; that of the translation is printed above the table.
 """
 
+import importlib.util
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -39,6 +40,8 @@ PER_HYPOTHESIS, PER_COST, PER_STEP = 1500, 4 * 16, 80
 #: Points that a hypothesis is scored on, and steps of the refinements, as counts.
 SCORED, STEPS = 64, 10
 PeerPose = tuple[np.ndarray, np.ndarray]
+#: pycolmap is optional, and its import takes a while: only where it is asked.
+HAS_COLMAP = importlib.util.find_spec("pycolmap") is not None
 
 
 def scene(batch: int, n: int, outliers: float, seed: int) -> tuple[Samples, Tracks, Camera, Pose]:
@@ -67,6 +70,20 @@ def ap3p(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     """OpenCV: AP3P in RANSAC, refined on the inliers."""
     options: Any = {"reprojectionError": THRESHOLD_PX, "iterationsCount": 1000, "confidence": 0.999}
     _, r, t, inlier = cv2.solvePnPRansac(xyz, uv, K, None, flags=cv2.SOLVEPNP_AP3P, **options)
+    return refined(xyz, uv, r, t, inlier)
+
+
+def magsac(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
+    """OpenCV: USAC with the MAGSAC score, refined on the inliers."""
+    params = cv2.UsacParams()
+    params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
+    params.threshold, params.maxIterations, params.confidence = THRESHOLD_PX, 1000, 0.999
+    _, _, r, t, inlier = cv2.solvePnPRansac(xyz, uv, K, None, params=params)
+    return refined(xyz, uv, r, t, inlier)
+
+
+def refined(xyz: np.ndarray, uv: np.ndarray, r: Any, t: Any, inlier: Any) -> PeerPose:
+    """Levenberg-Marquardt on the inliers."""
     index = inlier[:, 0]
     r, t = cv2.solvePnPRefineLM(xyz[index], uv[index], K, None, r, t)
     return cv2.Rodrigues(r)[0], t[:, 0]
@@ -81,7 +98,20 @@ def pose_lib(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     return pose.R, pose.t
 
 
-PEERS: dict[str, Callable[[np.ndarray, np.ndarray], PeerPose]] = {"opencv_ap3p": ap3p, "poselib": pose_lib}
+def colmap(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
+    """COLMAP's robust absolute pose, refined."""
+    import pycolmap
+
+    camera = pycolmap.Camera(model="PINHOLE", width=HW[1], height=HW[0], params=[FOCAL, FOCAL, HW[1] / 2, HW[0] / 2])
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.min_num_trials, options.ransac.confidence = THRESHOLD_PX, 100, 0.999
+    result: Any = pycolmap.estimate_and_refine_absolute_pose(uv, xyz, camera, options)
+    matrix = np.asarray(result["cam_from_world"].matrix())
+    return matrix[:, :3], matrix[:, 3]
+
+
+PEERS: dict[str, Callable[[np.ndarray, np.ndarray], PeerPose]] = {"opencv_ap3p": ap3p, "opencv_magsac": magsac}
+PEERS |= {"poselib": pose_lib} | ({"pycolmap": colmap} if HAS_COLMAP else {})
 
 
 def arrays(samples: Samples, tracks: Tracks) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -140,6 +170,8 @@ def measure(batch: int, n: int, outliers: float, options: Any) -> list[dict[str,
 def main() -> None:
     """Print the tables; write the rows with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
+    if not HAS_COLMAP:
+        print("pycolmap: skipped, not installed (pip install pycolmap)")
     rows = []
     with torch.inference_mode():
         for threads in (1, 2):

@@ -65,6 +65,23 @@ class Hdf5Array(NamedTuple):
             return np.asarray(array[index])
 
 
+def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
+    """Name → array, for the arrays of numbers at the top level of a file; reads no values.
+
+    Raises:
+        FormatError: missing or damaged file, an array stored in another file, or rows beyond ``MAX_FILE_BYTES``.
+        ImportError: no decoder is installed.
+    """
+    with _open_hdf5(file) as group:
+        if len(group) > _MAX_NAMES:
+            raise FormatError(file, "names", f"{len(group)}", f"at most {_MAX_NAMES}")
+        arrays = {}
+        for key in group:
+            array = _check_array(group, key, file)
+            arrays[key] = Hdf5Array(file, key, array.shape, array.dtype)
+        return arrays
+
+
 def list_hdf5_group(file: Path, path: str = "") -> dict[str, Hdf5Array | None]:
     """Name → array, or None for a group, of the group ``path``; entries of other kinds are left out.
 

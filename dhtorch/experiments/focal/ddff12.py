@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from dhtorch.data import convert
-from dhtorch.data.codecs.hdf5 import Hdf5Array, list_hdf5_group
+from dhtorch.data.codecs.hdf5 import Hdf5Array, list_hdf5_arrays
 from dhtorch.data.codecs.npy import parse_real_npy_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
@@ -81,7 +81,7 @@ def recognise(root: Path) -> str | None:
     if (root / "LightField").is_dir() and next((root / "LightField").glob("*/*/LF_*.npy"), None):
         return "light fields LightField/<split>/<scene>/LF_<n>.npy"
     sources = [root] if root.suffix in (".h5", ".hdf5") and root.is_file() else sorted(root.glob("*.h5"))[:1]
-    if sources and any(key.startswith(("stack_", "stacks_")) for key in list_hdf5_group(sources[0])):
+    if sources and any(key.startswith(("stack_", "stacks_")) for key in list_hdf5_arrays(sources[0])):
         return "HDF5 arrays stack_<split>"
     return None
 
@@ -161,7 +161,7 @@ def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation
     sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
     locations: list[_StackLocation] = []
     for file in sources:
-        arrays = list_hdf5_group(file)
+        arrays = list_hdf5_arrays(file)
         for key, stack in arrays.items():
             match = re.fullmatch(r"stacks?_(\w+)", key)
             if stack is None or not match:
