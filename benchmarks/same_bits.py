@@ -627,7 +627,9 @@ class Dump(NamedTuple):
 def environment(checkout: Path, mode: str, threads: int) -> dict[str, str]:
     """Variables of a process that runs a checkout in a mode."""
     kept = {name: value for name, value in os.environ.items() if name not in SWITCHES}
-    switched = dict.fromkeys(SWITCHES, "1" if mode == "compiled" else "0")  # a library in the cache loads without a word
+    switched = dict.fromkeys(
+        SWITCHES, "1" if mode == "compiled" else "0"
+    )  # a library in the cache loads without a word
     return {**kept, **switched, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
 
 
