@@ -16,7 +16,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class CodeEntry:
+class _CodeEntry:
     """Number and texts of one code."""
 
     number: int
@@ -26,19 +26,19 @@ class CodeEntry:
     retry: str = ""  # options of a job to try; empty = none
 
 
-_pending: list[CodeEntry] = []  # entries of the class body in execution
+_pending: list[_CodeEntry] = []  # entries of the class body in execution
 
 
 def code(number: int, definition: str, *, meaning: str = "", advice: str = "", retry: str = "") -> int:
-    """The number of a code; adds its :class:`CodeEntry` to the table whose class body calls this."""
-    _pending.append(CodeEntry(number, definition, meaning or definition, advice, retry))
+    """The number of a code; adds its :class:`_CodeEntry` to the table whose class body calls this."""
+    _pending.append(_CodeEntry(number, definition, meaning or definition, advice, retry))
     return number
 
 
 class CodeTable:
     """Base of the code tables: class attributes are plain integers, ``entries`` maps them to their entries."""
 
-    entries: ClassVar[dict[int, CodeEntry]]
+    entries: ClassVar[dict[int, _CodeEntry]]
 
     def __init_subclass__(cls) -> None:
         cls.entries = {entry.number: entry for entry in _pending}
@@ -289,7 +289,7 @@ def is_estimated(source: Any) -> Any:
     return is_swept(source) | (source == Source.RECOVERED)
 
 
-def describe(table: type[CodeTable], name: str) -> CodeEntry | None:
+def describe(table: type[CodeTable], name: str) -> _CodeEntry | None:
     """The entry of a code by its name in any case; None where the table has no such code."""
     numbers = {code_name: number for number, code_name in names(table).items()}
     return table.entries.get(numbers.get(name.upper(), -1))

@@ -39,14 +39,14 @@ N_MOTION_ERRORS = 4
 T1_68_QUANTILE: Final = 1.84
 
 
-class ModelHead(NamedTuple):
+class _ModelHead(NamedTuple):
     """Which parameters of ``y = s x + t`` are free."""
 
     scale: bool
     shift: bool
 
 
-class ErrorModel(NamedTuple):
+class _ErrorModel(NamedTuple):
     """Prior of a map's errors: standard deviations of log depth, 0 = absent."""
 
     head: str  # of MODEL_HEADS
@@ -62,10 +62,10 @@ class ErrorModel(NamedTuple):
 
 #: Head -> free parameters, the simplest first; of two with one free parameter the scale, which many maps lack.
 MODEL_HEADS: Final = {
-    "raw": ModelHead(scale=False, shift=False),
-    "scale": ModelHead(scale=True, shift=False),
-    "shift": ModelHead(scale=False, shift=True),
-    "affine": ModelHead(scale=True, shift=True),
+    "raw": _ModelHead(scale=False, shift=False),
+    "scale": _ModelHead(scale=True, shift=False),
+    "shift": _ModelHead(scale=False, shift=True),
+    "affine": _ModelHead(scale=True, shift=True),
 }
 
 #: Errors beside the head: standard deviations of tilt, field and curve (log depth), and whether the field is short.
@@ -80,10 +80,12 @@ _DRIFTS: Final = {
 }
 
 #: Name -> model: every head with every drift.
-ERROR_MODELS: Final = {head + drift: ErrorModel(head, *rest) for head in MODEL_HEADS for drift, rest in _DRIFTS.items()}
+ERROR_MODELS: Final = {
+    head + drift: _ErrorModel(head, *rest) for head in MODEL_HEADS for drift, rest in _DRIFTS.items()
+}
 
 
-class ErrorBasis(NamedTuple):
+class _ErrorBasis(NamedTuple):
     """Basis of the errors beside the head: whitened kernels over places and values."""
 
     low: Tensor  # (B, 1) least value, on the scale of ``_log_level``
@@ -100,7 +102,7 @@ class AlignmentProblem(NamedTuple):
     """References of a map, basis of its errors and initial heads: the input of :func:`fit_models`."""
 
     points: MetricReferences
-    basis: ErrorBasis
+    basis: _ErrorBasis
     start: Tensor  # (B, H, 2) initial heads, in the order of MODEL_HEADS
     level: Tensor  # (B, 1) median of y at the references
 
@@ -136,7 +138,7 @@ class ErrorModelFit(NamedTuple):
 
 def make_basis(
     x: Tensor, known: Tensor, *, of_depth: bool = True, options: AlignmentOptions = DEFAULT_ALIGNMENT_OPTIONS
-) -> ErrorBasis:
+) -> _ErrorBasis:
     """Map ``x`` (B, h, w), valid where ``known`` -> basis of its errors. Gradient: none."""
     h, w = x.shape[-2:]
     level = torch.where(known, _log_level(x), torch.nan).flatten(1).detach()
@@ -145,7 +147,7 @@ def make_basis(
     aspect = x.new_tensor([w / max(h, w), h / max(h, w)])
     v, u = torch.meshgrid(*(torch.linspace(0, 1, n).to(x) for n in FIELD_NODES), indexing="ij")
     node = torch.stack((u, v), -1).flatten(0, 1) * aspect
-    return ErrorBasis(
+    return _ErrorBasis(
         low=torch.where(has_range, low, 0.0)[:, None],
         width=torch.where(has_range, high - low, 1.0)[:, None],
         node=node,
@@ -179,7 +181,7 @@ def _whitener(node: Tensor, length: float) -> Tensor:
     return torch.linalg.solve_triangular(L, eye, upper=False).mT
 
 
-def evaluate_fields(basis: ErrorBasis, share: Tensor, short: Tensor) -> Tensor:
+def evaluate_fields(basis: _ErrorBasis, share: Tensor, short: Tensor) -> Tensor:
     """Slopes and field functions (B, K, N, SLOPES + F) at places (B, N, 2) of models whose correlation length is the
     ``short`` (B, K) or the long one."""
     lengths = zip(basis.options.field_lengths, basis.whiten, strict=True)
@@ -195,13 +197,13 @@ def interpolation_variance(model: Tensor, field: Tensor) -> Tensor:
     return sd.square()[..., None] * (1 - field[..., N_TILT_SLOPES:].square().sum(-1)).clamp_min(0)
 
 
-def evaluate_curves(basis: ErrorBasis, x: Tensor) -> Tensor:
+def evaluate_curves(basis: _ErrorBasis, x: Tensor) -> Tensor:
     """Functions (B, N, KNOTS) of the correction at values (B, N)."""
     along = ((_log_level(x) - basis.low) / basis.width).clamp(-0.2, 1.2)
     return _kernel(along[..., None], _knots(x), basis.options.curve_length) @ basis.whiten_curve
 
 
-def predict_log_depth(head: Tensor, x: Tensor, basis: ErrorBasis) -> tuple[Tensor, Tensor]:
+def predict_log_depth(head: Tensor, x: Tensor, basis: _ErrorBasis) -> tuple[Tensor, Tensor]:
     """Log depth (..., N) of heads (..., 2) at values (..., N), and its derivative (..., N, 2) by the heads.
 
     A head below the option ``min_head`` is replaced by it.
@@ -250,7 +252,7 @@ class _Problem(NamedTuple):
     head_sd: Tensor  # (M, 2) prior standard deviations
     sd: Tensor  # (M, Q) prior standard deviations
     freedom: Tensor  # (M, N) degrees of freedom of Student's t
-    basis: ErrorBasis
+    basis: _ErrorBasis
 
     def residuals(self, xi: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals (M, N), and the derivative (M, N, P) of the predicted log depth."""

@@ -146,9 +146,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         with open_output_folder(work.out, "out") as folder:
             before, owns, complaints = _write_missing_episodes(work, folder, settings, progress)
             if isinstance(work.target, LeRobotTarget):
-                write_enrich_card(work.target, work.shared, owns)
+                _write_enrich_card(work.target, work.shared, owns)
             if settings["report"]:
-                write_enrich_page(work.out / "meta", work.shared, owns)
+                _write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"complete episodes in {work.out} are kept; run the same command again for the rest"
@@ -530,12 +530,12 @@ def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
 
 
 def _page_files(folder: Path) -> tuple[Path, Path]:
-    """The files that :func:`write_enrich_page` writes: numbers and page."""
+    """The files that :func:`_write_enrich_page` writes: numbers and page."""
     numbers, page = REPORT_FILES
     return folder / numbers, folder / page
 
 
-def write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
+def _write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
     """Write the page and its numbers as JSON; returns the path of the page."""
     listed = [{k: own[k] for k in ("number", "length", "cameras")} for own in owns]
     codes = {"pixels": names(Source), "no_answer": NO_ANSWER_REASONS}
@@ -683,7 +683,7 @@ CARD = "README.md"
 _LICENCE = re.compile(r"\A---\n(?:.*\n)*?license:[ \t]*[\"']?([A-Za-z0-9][A-Za-z0-9.\-]{0,40})[\"']?[ \t]*\n")
 
 
-def write_enrich_card(target: LeRobotTarget, about: Mapping[str, Any], owns: Sequence[Row]) -> Path:
+def _write_enrich_card(target: LeRobotTarget, about: Mapping[str, Any], owns: Sequence[Row]) -> Path:
     """Write the card of a complete set; ``about``: metadata of all files, ``owns``: summaries of all episodes."""
     info, stats = (data_files.read_json(target.root / "meta" / name) for name in ("info.json", "stats.json"))
     card = target.root / SOURCE_CARD

@@ -135,7 +135,7 @@ def main(argv: list[str] | None = None) -> int:
     flags = [a for a in argv if a in console.VERBOSITY_FLAGS]
     argv = [a for a in argv if a not in flags]
     with console.escape_output(), console.set_verbosity(flags), console.show_warnings_in_a_line():
-        with catch_termination() as received:
+        with _catch_termination() as received:
             code = _run_guarded(argv)
         return 128 + received[0] if received else code  # as a shell reports it
 
@@ -703,7 +703,7 @@ _TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGH
 
 
 @contextlib.contextmanager
-def catch_termination() -> Iterator[list[int]]:
+def _catch_termination() -> Iterator[list[int]]:
     """Context in which the first SIGTERM or SIGHUP raises KeyboardInterrupt -> numbers of the received signals.
 
     Later ones do not interrupt the clean-up. A killed process cannot end its workers: a worker watches its parent, see

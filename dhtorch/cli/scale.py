@@ -64,7 +64,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
     with open_output_folder(out, "out"):
         if result.ok:
             write_model(model, out, similarity)
-        content = {"model": str(root), "format": model.format, "capture": recording.name, **describe_scale(result)}
+        content = {"model": str(root), "format": model.format, "capture": recording.name, **_describe_scale(result)}
         storage.write_json(out / "scale.json", storage.to_strict_json(content))
         _write_page(out / "scale.html", _model_name(root), result)
     for line in _format_lines(root, result):
@@ -73,7 +73,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Any)
     return 0 if result.ok else 1
 
 
-def describe_scale(result: ScaleResult) -> dict[str, Any]:
+def _describe_scale(result: ScaleResult) -> dict[str, Any]:
     """Result -> what ``scale.json`` holds."""
     low, high = result.interval()
     path = result.path

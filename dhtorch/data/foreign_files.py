@@ -192,7 +192,7 @@ _LAYOUTS: Final = (
 )
 
 
-class ForeignFile(NamedTuple):
+class _ForeignFile(NamedTuple):
     """What a file is, and the command that converts it."""
 
     what: str
@@ -207,17 +207,17 @@ class ForeignFile(NamedTuple):
         return None if self.command is None else f"the files that this command writes: {self.command}"
 
 
-def describe_foreign_file(file: Path) -> ForeignFile | None:
+def describe_foreign_file(file: Path) -> _ForeignFile | None:
     """What a file is and what converts it; None where its name's end is unknown."""
     name = file.name.lower()
     ends = [end for end in _CONVERTERS if name.endswith(end)]
     if ends:
         what, command = _CONVERTERS[max(ends, key=len)]
-        return ForeignFile(what, command.format(file.name))
+        return _ForeignFile(what, command.format(file.name))
     if file.suffix.lower() in _MODEL_SUFFIXES:
-        return ForeignFile("a finished 3D model without its frames", export=f"the frames, {PHONE_EXPORTS}")
+        return _ForeignFile("a finished 3D model without its frames", export=f"the frames, {PHONE_EXPORTS}")
     return (
-        ForeignFile(
+        _ForeignFile(
             _describe_video(file),
             export=f"colour and depth, {PHONE_EXPORTS}" if file.suffix.lower() in (".mp4", ".mov") else None,
         )
@@ -226,7 +226,7 @@ def describe_foreign_file(file: Path) -> ForeignFile | None:
     )
 
 
-def describe_layout(folder: Path, *, is_read: bool = False) -> ForeignFile | None:
+def describe_layout(folder: Path, *, is_read: bool = False) -> _ForeignFile | None:
     """What a folder with files of a known layout is or lacks, and what to do; None for a folder of another layout.
 
     Args:
@@ -239,9 +239,9 @@ def describe_layout(folder: Path, *, is_read: bool = False) -> ForeignFile | Non
             continue
         missing = [part.partition("|")[0].removesuffix("*") for part in layout.parts if not _has(base, part)]
         if missing and layout.is_read >= is_read:
-            return ForeignFile(f"{layout.what} without {', '.join(missing)}", export=layout.remedy)
+            return _ForeignFile(f"{layout.what} without {', '.join(missing)}", export=layout.remedy)
         if not (layout.is_read or is_read):
-            return ForeignFile(f"{layout.what}, which no reader supports", export=layout.remedy)
+            return _ForeignFile(f"{layout.what}, which no reader supports", export=layout.remedy)
     return None
 
 
@@ -285,7 +285,7 @@ def list_files(folder: Path) -> Iterator[Path]:
                 yield entry
 
 
-def describe_foreign_folder(folder: Path) -> ForeignFile | None:
+def describe_foreign_folder(folder: Path) -> _ForeignFile | None:
     """What a folder of a known layout, or of arrays alone, is or lacks, and what to do; None for other content."""
     if layout := describe_layout(folder):
         return layout
@@ -293,7 +293,7 @@ def describe_foreign_folder(folder: Path) -> ForeignFile | None:
     if not entries or any(entry.suffix.lower() not in _ARRAY_SUFFIXES for entry in entries):
         return None
     remedy = f"a capture with images; maps of one are an option: dhtorch validate CAPTURE --depth {folder}"
-    return ForeignFile(f"arrays ({entries[0].name}, …) and no images", export=remedy)
+    return _ForeignFile(f"arrays ({entries[0].name}, …) and no images", export=remedy)
 
 
 def _describe_video(file: Path) -> str:

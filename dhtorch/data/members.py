@@ -44,7 +44,7 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class ZipMember(Member):
+class _ZipMember(Member):
     """One entry of a zip archive."""
 
     archive: Path
@@ -143,5 +143,5 @@ def list_zip_members(archive: Path) -> dict[str, Member]:
         packed = entry.file_size if method == zipfile.ZIP_STORED else entry.compress_size
         path = Path(f"{archive}/{entry.filename}")  # an absolute name must not hide the archive's
         sizes = packed, entry.file_size
-        members[entry.filename] = ZipMember(path, archive, entry.header_offset, *sizes, method, entry.CRC)
+        members[entry.filename] = _ZipMember(path, archive, entry.header_offset, *sizes, method, entry.CRC)
     return members

@@ -30,7 +30,7 @@ _UNIT_FACTORS: Final = (0.1, 10.0, 0.2, 5.0, 0.01, 100.0, 0.001, 1000.0)
 _CODE_SHIFTS: Final = (8, 7, 6, 5, 4, 3)
 
 
-class PlausibilityFinding(NamedTuple):
+class _PlausibilityFinding(NamedTuple):
     """A doubt about stored depth."""
 
     code: str  # unit | shifted | byte_order | z_buffer | 8_bit
@@ -42,7 +42,7 @@ def plausibility_findings(
     depths: Iterable[Tensor],  # (h, w) m, 0 = no return
     unit: DepthUnit | None,
     sparse: bool = False,
-) -> list[PlausibilityFinding]:
+) -> list[_PlausibilityFinding]:
     """Depth maps, the unit by which they were converted and whether they are LiDAR sweeps -> findings, likeliest first.
 
     ``unit`` None: the format defines metres. A unit of 1 m, and None, mean that the values may be floats; any other
@@ -67,7 +67,7 @@ def plausibility_findings(
     return [] if finding is None else [finding]
 
 
-def _check_median(values: Tensor, unit: DepthUnit | None, sparse: bool) -> PlausibilityFinding | None:
+def _check_median(values: Tensor, unit: DepthUnit | None, sparse: bool) -> _PlausibilityFinding | None:
     median, metres = float(values.median()), 1.0 if unit is None else unit.metres
     # Integer codes are doubted beyond the reach of structured light, time of flight and stereo with a short baseline.
     # Source: chosen on the captures of DHTORCH_DATA, whose medians without sparse sets are at most 4 m.
@@ -85,13 +85,13 @@ def _check_median(values: Tensor, unit: DepthUnit | None, sparse: bool) -> Plaus
     read_as = "" if unit is None else f" with {unit}"
     likely = [f for f in _UNIT_FACTORS if _LIKELY_MEDIAN_M[0] <= median * f <= _LIKELY_MEDIAN_M[1]]
     if not likely:
-        return PlausibilityFinding("unit", f"{text}{read_as}: wrong depth unit?", "data.depth_unit=…")
+        return _PlausibilityFinding("unit", f"{text}{read_as}: wrong depth unit?", "data.depth_unit=…")
     likelier = metres * likely[0]
     text = f"{text}{read_as}: depth unit {format_unit(likelier)}?"
-    return PlausibilityFinding("unit", text, f"data.depth_unit={format_unit(likelier).removesuffix(' m')}")
+    return _PlausibilityFinding("unit", text, f"data.depth_unit={format_unit(likelier).removesuffix(' m')}")
 
 
-def _check_shifted(values: Tensor, metres: float) -> PlausibilityFinding | None:
+def _check_shifted(values: Tensor, metres: float) -> _PlausibilityFinding | None:
     codes = (values / metres).round().long()
     shifts = [n for n in _CODE_SHIFTS if float((codes % 2**n == 0).double().mean()) >= 0.98]
     if not shifts or bool((codes == codes[0]).all()):
@@ -99,10 +99,10 @@ def _check_shifted(values: Tensor, metres: float) -> PlausibilityFinding | None:
     n = shifts[0]
     where = ", as SUN3D and SUN RGB-D rotate them" if n == 3 else ""
     text = f"depth codes are multiples of {2**n}: shifted by {n} bits{where}?"
-    return PlausibilityFinding("shifted", text, f"data.depth_unit={format_unit(metres / 2**n).removesuffix(' m')}")
+    return _PlausibilityFinding("shifted", text, f"data.depth_unit={format_unit(metres / 2**n).removesuffix(' m')}")
 
 
-def _check_byte_order(codes: Sequence[Tensor]) -> PlausibilityFinding | None:
+def _check_byte_order(codes: Sequence[Tensor]) -> _PlausibilityFinding | None:
     steps: list[Tensor] = []
     for code in codes:
         left, right = code[:, :-1].long(), code[:, 1:].long()
@@ -121,10 +121,10 @@ def _check_byte_order(codes: Sequence[Tensor]) -> PlausibilityFinding | None:
         return None
     ratio = stored / swapped
     text = f"neighbouring depths differ {ratio:.0f} times as much as with swapped bytes: codes of the other byte order?"
-    return PlausibilityFinding("byte_order", text, "swap the bytes of the 16-bit codes (numpy: codes.byteswap())")
+    return _PlausibilityFinding("byte_order", text, "swap the bytes of the 16-bit codes (numpy: codes.byteswap())")
 
 
-def _check_8_bit(values: Tensor, metres: float) -> PlausibilityFinding | None:
+def _check_8_bit(values: Tensor, metres: float) -> _PlausibilityFinding | None:
     codes = (values / metres).round().unique()
     # Most different values of 8-bit depth. Source: derived, 2^8.
     if not 2 < len(codes) <= 256:
@@ -138,10 +138,10 @@ def _check_8_bit(values: Tensor, metres: float) -> PlausibilityFinding | None:
     if step * metres < 0.004 * float(values.median()) or equal < 0.7 or step < 3:
         return None
     text = f"only {len(codes)} different depths in equal steps of {step * metres:.3g} m: 8-bit depth?"
-    return PlausibilityFinding("8_bit", text, "export depth with 16 bits or as floats")
+    return _PlausibilityFinding("8_bit", text, "export depth with 16 bits or as floats")
 
 
-def _check_z_buffer(values: Tensor) -> PlausibilityFinding | None:
+def _check_z_buffer(values: Tensor) -> _PlausibilityFinding | None:
     if float(values.max()) > 1:
         return None
     # Values that a z-buffer in [0, 1] has in scenes beyond ten near planes: 1 - near / depth. Source: derived, 1 -
@@ -152,6 +152,6 @@ def _check_z_buffer(values: Tensor) -> PlausibilityFinding | None:
         return None
     low, high = values.quantile(torch.tensor([0.01, 0.99], dtype=values.dtype)).tolist()
     text = f"depth values from {low:.4f} to {high:.4f}, none above 1: z-buffer (non-linear depth)?"
-    return PlausibilityFinding(
+    return _PlausibilityFinding(
         "z_buffer", text, "depth = near / (1 - value * (1 - near / far)), with the camera's planes"
     )

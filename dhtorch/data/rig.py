@@ -30,7 +30,7 @@ class Rig(Recording):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TruthRig(Rig, TruthRecording):
+class _TruthRig(Rig, TruthRecording):
     """A rig whose cameras all have ground truth."""
 
     def truth(self, index: int) -> dict[str, Tensor]:
@@ -88,7 +88,7 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
         for r in recordings
         if len(r) > n
     ]
-    make = TruthRig if truth else Rig
+    make = _TruthRig if truth else Rig
     R, t = (
         _gather_by_camera([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, flat)
         for k in "Rt"

@@ -20,7 +20,7 @@ def hide_nothing(frame: Frame, _cutoff: float | None) -> Frame:
     return frame
 
 
-class PoseHalfClassifier:
+class _PoseHalfClassifier:
     """Classify stage of the hold-out: removes the returns of set B after it, so that only set A determines the pose."""
 
     def __init__(self, classify: Any, seed: int, min_trackability: float) -> None:
@@ -41,7 +41,7 @@ class HeldOut:
 
     def variant(self, **more: Any) -> Variant:
         """Variant with set B hidden from the method; without view selection, which would use the returns of set B."""
-        half = PoseHalfClassifier(self.method.classify, self.seed, self.method.min_trackability)
+        half = _PoseHalfClassifier(self.method.classify, self.seed, self.method.min_trackability)
         return Variant(self.method.replace(classify=half), two_frames=True, **more)
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:

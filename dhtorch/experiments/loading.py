@@ -89,7 +89,7 @@ FrameChunk = tuple[Recording, Sequence[tuple[int, ...]], bool]
 LoadedChunk = tuple[list[tuple[Frame, ...]], list[Tensor]]
 
 
-class ChunkDataset(Dataset[LoadedChunk]):
+class _ChunkDataset(Dataset[LoadedChunk]):
     """Data set of chunks of frames, of any recordings; a position is read once per chunk."""
 
     def __init__(self, chunks: Sequence[FrameChunk], dtype: torch.dtype) -> None:
@@ -109,7 +109,7 @@ class ChunkDataset(Dataset[LoadedChunk]):
 
 def read_chunks(chunks: Sequence[FrameChunk], dtype: torch.dtype, workers: int) -> Iterator[LoadedChunk]:
     """Read chunks in order, in ``workers`` processes that start once for all of them (0: in this process)."""
-    data = ChunkDataset(chunks, dtype)
+    data = _ChunkDataset(chunks, dtype)
     return iter(_make_loader(data, _unchanged, batch=None, workers=min(workers, len(data))))
 
 

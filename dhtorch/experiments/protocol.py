@@ -283,7 +283,7 @@ def far_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Trut
     )
 
 
-def range_split_cohorts(settings: Settings) -> dict[str, Cohort]:
+def _range_split_cohorts(settings: Settings) -> dict[str, Cohort]:
     """Cohorts of the range split by their truth test, one for each of ``settings.truth``."""
     return {test: partial(held_back_truth, test=test) for test in settings.truth}
 
@@ -353,7 +353,7 @@ def run_protocol(
     Raises:
         ValueError: bad data or options, as the readers, ``pairs`` and the hold-out raise them.
     """
-    protocol = protocol if protocol.cohorts else replace(protocol, cohorts=range_split_cohorts(settings))
+    protocol = protocol if protocol.cohorts else replace(protocol, cohorts=_range_split_cohorts(settings))
     outcome = Outcome(cohort=list(protocol.cohorts)[-1])
     keep = settings.finished.loop({name: variant.method for name, variant in protocol.variants.items()})
     for scene in scenes_of(scenes):

@@ -10,7 +10,7 @@ from dhtorch.records import Frame
 
 
 @dataclass(frozen=True, eq=False)
-class SubsampledScenes(LazySequence[Scene]):
+class _SubsampledScenes(LazySequence[Scene]):
     """Scenes of every ``every``-th frame, of at most ``max_frames`` frames each."""
 
     scenes: Sequence[Scene]
@@ -50,7 +50,7 @@ class SelectedRecordings(LazySequence[Recording]):
 
 def subsample_scenes(scenes: Sequence[Scene], every: int, max_frames: int | None) -> Sequence[Scene]:
     """Scenes -> scenes of every ``every``-th frame, of the first ``max_frames`` of these; None = all."""
-    return scenes if every == 1 and max_frames is None else SubsampledScenes(scenes, every, max_frames)
+    return scenes if every == 1 and max_frames is None else _SubsampledScenes(scenes, every, max_frames)
 
 
 def _load_every(load: Callable[[int], Frame], every: int, position: int) -> Frame:

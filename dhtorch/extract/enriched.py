@@ -76,10 +76,10 @@ class DatasetCamera:
             recording[0]  # raises the error of the reader
             raise ValueError(f"{recording.name}: found no frame with an image, expected one")
         map_hw = dense.map_hw(frame.hw, size)
-        return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, get_distortion(frame))
+        return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, _get_distortion(frame))
 
 
-def get_distortion(frame: Frame) -> tuple[float, ...]:
+def _get_distortion(frame: Frame) -> tuple[float, ...]:
     """Frame -> distortion coefficients in OpenCV's order; empty without distortion."""
     distortion = frame.camera.distortion
     return () if distortion is None else tuple(distortion[0].tolist())
@@ -149,10 +149,10 @@ class MapRowDataset(RowDataset):
             raise SampleError(
                 f"image: found {format_hw(reference.hw)}, expected {format_hw(view.hw)} as of the first frame"
             )
-        if get_distortion(reference) != view.lens:
+        if _get_distortion(reference) != view.lens:
             expected = list(view.lens) or "none"
             raise SampleError(
-                f"distortion: found {list(get_distortion(reference)) or 'none'}, expected {expected} as of the first "
+                f"distortion: found {list(_get_distortion(reference)) or 'none'}, expected {expected} as of the first "
                 "frame"
             )
         others = opened.others(i)

@@ -61,7 +61,7 @@ GRADIENT_NOISE = 2 * (3**2 + 10**2 + 3**2) / 32**2
 MAX_NOISE_RATIO = 0.9
 
 
-class AffineRegistration(NamedTuple):
+class _AffineRegistration(NamedTuple):
     """Result of :func:`register_affine` for B × N points."""
 
     uv_1: Tensor  # (B, N, 2) px, the position of uv_0 in image 1
@@ -106,7 +106,7 @@ def register_affine(
     iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
-) -> AffineRegistration:
+) -> _AffineRegistration:
     """Points ``uv_0`` and their tracks ``uv_1`` -> registered positions, up to an affine motion, a gain and a bias.
 
     A track is the position where a window fits best by *translation alone*; under the perspective of a slanted surface
@@ -125,7 +125,7 @@ def register_affine(
         max_shift_px: a search that ends further from its start is rejected.
 
     Returns:
-        :class:`AffineRegistration`. Rejected (not ok): without texture, not finite, too far, magnification or gain out
+        :class:`_AffineRegistration`. Rejected (not ok): without texture, not finite, too far, magnification or gain out
         of range, outside the image, or a larger residual than at the start; the values are then those of the start.
         ``cov`` is first-order and for white noise of equal variance in both images, which it estimates from the
         residual; interpolation smooths that noise and the noise of T's gradient inflates A; both are accounted for.
@@ -155,7 +155,7 @@ def register_affine(
         return y.to(uv_0.dtype) if y.is_floating_point() else y
 
     registered, linear, rms, cov, shift_px, ok = (grid(y) for y in fields)
-    return AffineRegistration(torch.where(ok[..., None], registered, uv_1.detach()), linear, rms, cov, shift_px, ok)
+    return _AffineRegistration(torch.where(ok[..., None], registered, uv_1.detach()), linear, rms, cov, shift_px, ok)
 
 
 @shaped("uv_0: B N 2, uv_1: B N 2, linear: B N 2 2, source.levels.0: B C H W, target.levels.0: B c h w")
@@ -213,7 +213,7 @@ def _register(
     start_linear: Tensor,  # (2, 2, M)
     batch: Tensor,  # (M,)
 ) -> tuple[Tensor, ...]:
-    """Points and start -> fields of an :class:`AffineRegistration`, points last."""
+    """Points and start -> fields of an :class:`_AffineRegistration`, points last."""
     target, window = views.target, views.window
     q = round_half_up(xy_0)
     point = _window_coordinates(xy_0 - q, window)

@@ -172,7 +172,7 @@ def mean_flow_form(xyz: Tensor, known: Tensor, f: Tensor, c: Tensor) -> Tensor:
     return normal_equations(rows, known.to(f.dtype))[0] / known.sum(-1).clamp_min(1)[:, None, None]
 
 
-class EpipolarMotion(NamedTuple):
+class _EpipolarMotion(NamedTuple):
     """Result of :func:`fit_epipolar_motion`."""
 
     T: Pose  # view 1 from view 0, |t| = 1
@@ -188,7 +188,7 @@ def fit_epipolar_motion(
     R: Tensor,  # (B, 3, 3) start, e.g. the pure rotation that fits best
     f_px: Tensor,  # (B,) focal length that turns angles into px
     bend_px: Tensor,  # (B,) bend of the robust kernel at the end
-) -> EpipolarMotion:
+) -> _EpipolarMotion:
     """Rotation and direction of translation that minimise robust distances to epipolar lines, in float64.
 
     The first direction is that of least squares under the start's rotation; steps on five unknowns follow while the
@@ -228,7 +228,7 @@ def fit_epipolar_motion(
     # Length of an inlier's distance, in standard deviations. Source: derived, one in 370 Gaussian numbers lies
     # beyond.
     inlier = inside & (distance.abs() < 3.0 * noise[:, None])
-    return EpipolarMotion(Pose(R, (R @ s[..., None])[..., 0]), noise, inlier)
+    return _EpipolarMotion(Pose(R, (R @ s[..., None])[..., 0]), noise, inlier)
 
 
 def _epipolar_step(x: Tensor, b: Tensor, a: Tensor, s: Tensor, weight: Tensor, *, R: Tensor) -> tuple[Tensor, Tensor]:

@@ -395,7 +395,7 @@ def _min_last(x: Tensor) -> Tensor:
     return x.amin(-1, keepdim=True)
 
 
-class BestPlane(NamedTuple):
+class _BestPlane(NamedTuple):
     """The best plane of every pixel."""
 
     plane: Tensor  # (B, h, w) int64
@@ -404,9 +404,9 @@ class BestPlane(NamedTuple):
 
 
 @shaped("S: B h w D")
-def best_plane(S: Tensor) -> BestPlane:
+def best_plane(S: Tensor) -> _BestPlane:
     """Aggregated costs S (B, h, w, D) -> plane of least cost, the first of equals, and parabolic sub-plane shift."""
-    return BestPlane(
+    return _BestPlane(
         *(torch.cat(part, 1) for part in zip(*map(_argmin_subplane, S.split(ROWS_PER_BLOCK, 1)), strict=True))
     )
 
@@ -424,10 +424,10 @@ def _argmin_subplane(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
-def _aggregate_best_plane_kernel(C: Tensor, views: Tensor) -> tuple[BestPlane, Tensor]:
+def _aggregate_best_plane_kernel(C: Tensor, views: Tensor) -> tuple[_BestPlane, Tensor]:
     B, h, w, D = C.shape
     prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP_COST, JUMP_COST))
-    best = BestPlane(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
+    best = _BestPlane(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
     sampled_costs = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
     torch.ops.dhtorch.aggregate_best_plane.default(C, *prices, *best, sampled_costs)
     return best, sampled_costs
@@ -441,7 +441,7 @@ def _aggregate_best_plane_kernel(C: Tensor, views: Tensor) -> tuple[BestPlane, T
 def aggregate_best_plane(
     C: Tensor,  # (B, h, w, D) uint8
     views: Tensor,  # (B,) number of views whose costs C sums
-) -> tuple[BestPlane, Tensor]:
+) -> tuple[_BestPlane, Tensor]:
     """Costs C -> best planes, and the aggregated costs (B, ⌈h/2⌉, ⌈w/2⌉, D) of every other row and column.
 
     :func:`best_plane` of :func:`aggregate_costs`; the kernel keeps the aggregated costs of two rows only.
@@ -450,7 +450,7 @@ def aggregate_best_plane(
     return best_plane(S), S[:, ::2, ::2]
 
 
-def second_best_margin(some: Tensor, best: BestPlane, reach: Tensor) -> Tensor:
+def second_best_margin(some: Tensor, best: _BestPlane, reach: Tensor) -> Tensor:
     """Cost margin (B, h, w) of the best plane over the best one further than ``reach`` (B,) planes away.
 
     Computed at every other row and column from the costs ``some`` (B, ⌈h/2⌉, ⌈w/2⌉, D) of
@@ -486,7 +486,7 @@ def _second_best(costs: Tensor, plane: Tensor, reach: Tensor) -> Tensor:
     return torch.cat(least, 1)
 
 
-class WindowFit(NamedTuple):
+class _WindowFit(NamedTuple):
     """Fit of the grey values around every pixel in one source view at given depths; (B, h, w) each."""
 
     step: Tensor  # 1/m, the Gauss-Newton step of inverse depth
@@ -511,7 +511,7 @@ def fit_windows(
     q: Tensor,  # (B, h, w) 1/m
     *,
     radius: int = FIT_RADIUS_PX,
-) -> WindowFit:
+) -> _WindowFit:
     """Inverse depths q -> one Gauss-Newton step per pixel towards equal grey values in its window, up to gain and bias.
 
     Every pixel of a window is sampled at its own depth, so that slanted and curved surfaces are compared undistorted.
@@ -528,7 +528,7 @@ def fit_windows(
 
 def _fit_windows_kernel(
     grey: Tensor, picture_1: Tensor, uv: Tensor, uv_nearer: Tensor, delta_q: Tensor, in_front: Tensor, *, radius: int
-) -> WindowFit:
+) -> _WindowFit:
     positions = uv.mT.contiguous(), uv_nearer.mT.contiguous(), delta_q[:, 0]
     outputs = step, contrast, noise, correlation = tuple(torch.empty_like(grey[:, 0]) for _ in range(4))
     inside = torch.empty_like(step, dtype=torch.bool)
@@ -536,7 +536,7 @@ def _fit_windows_kernel(
     limits = *WINDOW_GAIN_RANGE, FLAT_VARIANCE, FLAT_GRADIENT_VARIANCE
     torch.ops.dhtorch.fit_windows.default(grey, picture_1, *positions, *outputs, inside, motion, *limits)
     seen = inside & in_front.view_as(inside)
-    return WindowFit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
+    return _WindowFit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
 @operator(
@@ -547,7 +547,7 @@ def _fit_windows_kernel(
 )
 def _fit_windows(
     grey: Tensor, picture_1: Tensor, uv: Tensor, uv_nearer: Tensor, delta_q: Tensor, in_front: Tensor, *, radius: int
-) -> WindowFit:
+) -> _WindowFit:
     """:func:`fit_windows` of view 0's grey values (B, 1, h, w) and the pixels of view 1 that they project to: ``uv``
     (B, N, 2), and ``uv_nearer`` (B, N, 2) for inverse depths larger by ``delta_q`` (B, 1) 1/m; ``in_front`` (B, N)."""
     hw = grey.shape[-2:]
@@ -563,7 +563,7 @@ def _fit_windows(
     ii, jj, ij = (ii - i * i).clamp_min(FLAT_VARIANCE), (jj - j * j).clamp_min(FLAT_VARIANCE), ij - i * j
     kk = (kk - k * k).clamp_min(FLAT_GRADIENT_VARIANCE)
     gain = (ij / jj).clamp(*WINDOW_GAIN_RANGE)
-    return WindowFit(
+    return _WindowFit(
         step=((ki - k * i) - gain * (kj - k * j)) / (gain * kk),
         contrast=kk * gain * gain,
         noise=(ii + gain * gain * jj - 2 * gain * ij).clamp_min(0),

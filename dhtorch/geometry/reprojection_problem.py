@@ -137,7 +137,7 @@ def track_constants(problem: PoseDepthProblem) -> TrackConstants:
     )
 
 
-class LinearisedTracks(NamedTuple):
+class _LinearisedTracks(NamedTuple):
     """The tracks of a problem linearised at z = 1: two equations each, inverse depths not yet eliminated."""
 
     u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
@@ -151,7 +151,7 @@ class LinearisedTracks(NamedTuple):
 @shaped("problem.ray: B 3 N, problem.uv: B 2 N, at.shutter_rate: B 3")
 def linearise_tracks(
     problem: PoseDepthProblem, at: Unknowns, *, columns: bool = True, known: TrackConstants | None = None
-) -> LinearisedTracks:
+) -> _LinearisedTracks:
     """Residuals and Jacobian of a problem at the sensor's inverse depths, and at the most probable ones of far tracks.
 
     Without ``columns`` the residuals alone, the same bits: enough for :func:`squared_residuals`. ``known`` is
@@ -178,7 +178,7 @@ def linearise_tracks(
     slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
     if not columns:
         r = plane - seen
-        return LinearisedTracks(r[:, :1], r[:, 1:], slope, free, front, known)
+        return _LinearisedTracks(r[:, :1], r[:, 1:], slope, free, front, known)
     k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
@@ -186,11 +186,11 @@ def linearise_tracks(
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return LinearisedTracks(u, v, slope, free, front, known)
+    return _LinearisedTracks(u, v, slope, free, front, known)
 
 
 def whitened_residuals(
-    linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor], shutter_rate: bool = True
+    linear: _LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor], shutter_rate: bool = True
 ) -> Tensor:
     """Whitened rows (B, 10, 2, N) without inverse depths: six columns of the pose, three of the shutter, the residual.
 
@@ -208,7 +208,7 @@ def whitened_residuals(
     return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
 
-def squared_residuals(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+def squared_residuals(linear: _LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """Squared length (B, N) of the whitened residuals; :data:`BEHIND_CAMERA_RESIDUAL` for points behind camera 1.
 
     Gradient: as :func:`whitened_residuals`.
@@ -228,7 +228,7 @@ def squared_residuals_at(
     """
 
     @cache
-    def linear() -> LinearisedTracks:
+    def linear() -> _LinearisedTracks:
         return linearise_tracks(problem, at, columns=False, known=known)
 
     return lambda noise: _squares(*_track_tensors(problem, known, noise_factors(known, noise), at), linear=linear)
@@ -297,7 +297,7 @@ def _has_whole_lanes(ray: Tensor, *_: Tensor | None, **__: Any) -> bool:
     any_layout=("R", "t", "shutter_rate"),
     when=_has_whole_lanes,
 )
-def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
+def _squares(*tensors: Any, linear: Callable[[], _LinearisedTracks]) -> tuple[Tensor, Tensor]:
     """Squared whitened residuals (B, N) of :func:`_track_tensors` linearised as ``linear``, and tracks in front."""
     tracks, (a, b, d) = linear(), tensors[8:11]
     return squared_residuals(tracks, (a, b, d)), tracks.front
@@ -525,7 +525,7 @@ def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquat
     when=_is_geman_mcclure,
 )
 def _equations(
-    *tensors: Any, linear: Callable[[], LinearisedTracks], robust: tuple[str | None, float]
+    *tensors: Any, linear: Callable[[], _LinearisedTracks], robust: tuple[str | None, float]
 ) -> NormalEquations:
     """Cost, H and g of :func:`_track_tensors` with the weight ``share`` (B, N) of each track, before any prior."""
     tracks, (a, b, d), shutter_rate, share = linear(), tensors[8:11], tensors[-2], tensors[-1]
@@ -541,7 +541,7 @@ def _equations(
     any_layout=("R", "t", "shutter_rate"),
     when=_is_geman_mcclure,
 )
-def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: tuple[str | None, float]) -> Tensor:
+def _robust_cost(*tensors: Any, linear: Callable[[], _LinearisedTracks], robust: tuple[str | None, float]) -> Tensor:
     """The cost (B,) of :func:`_equations` alone."""
     square = squared_residuals(linear(), tensors[8:11])
     return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
@@ -594,7 +594,7 @@ def _sandwich(
     return reference()
 
 
-def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:
+def _square(linear: _LinearisedTracks, r: Tensor) -> Tensor:
     """Squared length (B, N) of whitened residuals (B, 2, N)."""
     return torch.where(linear.front, (r * r).sum(1), BEHIND_CAMERA_RESIDUAL)
 
@@ -626,7 +626,7 @@ def noise_factors(constants: TrackConstants, noise: Tensor) -> tuple[Tensor, Ten
     return xx.rsqrt(), b, (yy - b * xy).rsqrt()
 
 
-def _whitener(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _whitener(linear: _LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
     With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: its

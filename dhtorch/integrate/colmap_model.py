@@ -48,7 +48,7 @@ class _Points(NamedTuple):
     uv: Tensor  # (P, 2, 2) px
 
 
-class ColmapCounts(NamedTuple):
+class _ColmapCounts(NamedTuple):
     """Points of a written workspace."""
 
     n_points: int
@@ -58,7 +58,7 @@ class ColmapCounts(NamedTuple):
 
 def write_colmap_workspace(
     folder: Path, recording: Recording, answers: Sequence[PairEstimate], poses: Mapping[int, Pose]
-) -> ColmapCounts:
+) -> _ColmapCounts:
     """Write the pictures, cameras, poses and points of a map.
 
     Observations farther than 4 px from the point's projection are left out, and recovered points with a single
@@ -92,7 +92,7 @@ def write_colmap_workspace(
     joined = _Points(*(torch.cat(column) for column in zip(*(points or [empty]), strict=True)))
     write_colmap(folder / MODEL_FOLDER, shots, joined.xyz, **{k: v for k, v in joined._asdict().items() if k != "xyz"})
     pairs = int((joined.seen_by >= 0).all(1).sum())
-    return ColmapCounts(len(joined.xyz), pairs, sum(n for _, n in parts))
+    return _ColmapCounts(len(joined.xyz), pairs, sum(n for _, n in parts))
 
 
 def _undistort(frame: Frame) -> tuple[np.ndarray, Camera]:

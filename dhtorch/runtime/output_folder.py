@@ -176,7 +176,7 @@ class OutputFolder:
 
     def _name(self, path: Path) -> str:
         """Path relative to the root."""
-        name = find_relative_path(path, self.root)
+        name = _find_relative_path(path, self.root)
         if name is None:
             raise ValueError(f"{path}: expected a path below {self.root}")
         return name.as_posix()
@@ -295,12 +295,12 @@ def open_output_file(file: str | Path, option: str) -> Iterator[OutputFolder]:
 
 def find_output_folder(path: Path) -> OutputFolder | None:
     """The innermost open folder to which a file belongs; None for private files and outside of all."""
-    if any(find_relative_path(path, each.private) is not None for each in _open_folders):
+    if any(_find_relative_path(path, each.private) is not None for each in _open_folders):
         return None
     matches = [
         each
         for each in _open_folders
-        if find_relative_path(path, each.root) is not None and each.only in (None, path.absolute())
+        if _find_relative_path(path, each.root) is not None and each.only in (None, path.absolute())
     ]
     return max(matches, key=lambda each: len(each.root.parts), default=None)
 
@@ -333,7 +333,7 @@ def is_private(path: Path) -> bool:
     return any(part.startswith(".") and part.endswith(PRIVATE_FOLDER) for part in path.parts)
 
 
-def find_relative_path(path: Path, root: Path) -> Path | None:
+def _find_relative_path(path: Path, root: Path) -> Path | None:
     """Path relative to ``root`` (absolute), as written or with links resolved; None = not below ``root``."""
     absolute = path.absolute()
     if absolute.is_relative_to(root) and ".." not in (name := absolute.relative_to(root)).parts:

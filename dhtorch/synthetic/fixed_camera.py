@@ -41,7 +41,7 @@ _EXPOSURES, _EXPONENTS, _NOISE_LEVELS = (0.6, 1.5), (0.85, 1.2), (0.5, 3.0)
 
 
 @lru_cache(maxsize=3)
-def lit_room(seed: int, light: str) -> ShadedRoom:
+def _lit_room(seed: int, light: str) -> ShadedRoom:
     """The furnished room of a seed under one of :data:`ROOM_LIGHTS`; cached for the last three."""
     room = furnished_room(seed)
     return room if light == "day" else room.relit(*ROOM_LIGHTS[light])
@@ -62,7 +62,7 @@ class LitRoom(SyntheticRoom):
 
     def world(self, index: int) -> ShadedRoom:
         """The room under its light."""
-        return lit_room(self.seed, self.light)
+        return _lit_room(self.seed, self.light)
 
 
 def photograph_again(frame: Frame, draw: Random) -> Frame:

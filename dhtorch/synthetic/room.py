@@ -100,7 +100,7 @@ def make_box(
     return Solid((x, -height - half[1], z), half, surface, R, **more)  # type: ignore[arg-type]
 
 
-def make_ball(x: float, height: float, z: float, radius: float, surface: Material, **more: object) -> Solid:
+def _make_ball(x: float, height: float, z: float, radius: float, surface: Material, **more: object) -> Solid:
     """A ball resting ``height`` above the floor."""
     return Solid((x, -height - radius, z), (radius, radius, radius), surface, ball=True, **more)  # type: ignore[arg-type]
 
@@ -143,7 +143,7 @@ def _divider(draw: Random) -> list[Solid]:
             _LAMP_CENTRE[0], _LAMP_CENTRE[1] + 0.17, _LAMP_CENTRE[2], (0.012, 1.0, 0.012), _BLACK_PLASTIC, shadow=False
         )
     )
-    return [*parts, make_ball(_LAMP_CENTRE[0], _LAMP_CENTRE[1] - 0.17, _LAMP_CENTRE[2], 0.17, shade, shadow=False)]
+    return [*parts, _make_ball(_LAMP_CENTRE[0], _LAMP_CENTRE[1] - 0.17, _LAMP_CENTRE[2], 0.17, shade, shadow=False)]
 
 
 def _on_the_divider(draw: Random) -> list[Solid]:
@@ -151,11 +151,11 @@ def _on_the_divider(draw: Random) -> list[Solid]:
     return [
         *_plant(x - 0.92, top, z + 0.05, 1.1),
         make_box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), _OAK_WOOD, yaw=10),
-        make_ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Material("globe", tile=0.36)),
+        _make_ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Material("globe", tile=0.36)),
         make_box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Material("poster:1"), yaw=draw.uniform(4, 14)),
         *_laptop(x + 0.42, top, z - 0.03),
-        make_ball(x - 0.40, top, z - 0.06, 0.04, Material("speckle", (1.0, 0.55, 0.15), 0.25)),
-        make_ball(x - 0.46, top, z - 0.12, 0.042, Material("speckle", (0.9, 0.2, 0.15), 0.25)),
+        _make_ball(x - 0.40, top, z - 0.06, 0.04, Material("speckle", (1.0, 0.55, 0.15), 0.25)),
+        _make_ball(x - 0.46, top, z - 0.12, 0.042, Material("speckle", (0.9, 0.2, 0.15), 0.25)),
     ]
 
 
@@ -179,7 +179,7 @@ def _plant(x: float, height: float, z: float, size: float) -> list[Solid]:
     pot = Material("speckle")
     bush = ((0, 0, 0.10), (-0.06, -0.03, 0.07), (0.05, 0.04, 0.075), (0.02, -0.06, 0.06))
     balls = [
-        make_ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
+        _make_ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
         for k, (dx, dz, r) in enumerate(bush)
     ]
     return [make_box(x, height, z, (0.10 * size, 0.16 * size, 0.10 * size), pot, yaw=30), *balls]
@@ -218,7 +218,7 @@ def _seats(draw: Random) -> list[Solid]:
         make_box(0.35, 0.36, 3.1, (0.85, 0.04, 0.5), _PALE_WOOD, yaw=8),
         *_legs(0.35, 3.1, (0.85, 0.36, 0.5), 0.05, _PALE_WOOD, 8),
         make_box(0.25, 0.40, 3.1, (0.21, 0.012, 0.28), Material("page"), yaw=-30),
-        make_ball(0.58, 0.40, 3.15, 0.09, Material("speckle", tile=0.3)),
+        _make_ball(0.58, 0.40, 3.15, 0.09, Material("speckle", tile=0.3)),
     ]
     x, z, yaw = -1.75, 3.2, draw.uniform(55, 68)
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
@@ -247,7 +247,7 @@ def _back_wall(draw: Random) -> list[Solid]:
         make_box(x, 0.10, z - 0.43, (0.015, 0.46, 0.02), _OAK_WOOD),
         make_box(x, 0.72, z - 0.06, (1.15, 0.66, 0.05), _BLACK_PLASTIC, faces={_FACE_NEG_Z: _SCREEN_GLASS}),
         make_box(x - 0.55, 0.58, z - 0.25, (0.13, 0.18, 0.12), Material("speckle", (0.6, 0.8, 0.9), 0.3), yaw=20),
-        make_ball(x - 0.55, 0.74, z - 0.25, 0.13, Material("leaves", tile=0.4)),
+        _make_ball(x - 0.55, 0.74, z - 0.25, 0.13, Material("leaves", tile=0.4)),
         make_box(x + 0.58, 0.58, z - 0.22, (0.16, 0.22, 0.02), Material("poster:3"), yaw=-12, pitch=-8),
         make_box(x, 1.60, z - 0.02, (0.85, 0.60, 0.03), Material("landscape", (0.85, 0.8, 0.75))),
         make_box(1.38, 0.80, z - 0.025, (0.66, 1.16, 0.03), _PALE_WOOD),

@@ -351,7 +351,7 @@ def _remove_returns(frame: Frame, gone: Tensor) -> Frame:
     return frame.replace(depth=depth)
 
 
-class MovingBody(NamedTuple):
+class _MovingBody(NamedTuple):
     """A moving body of a stress."""
 
     guest: str  # name in guests.MOVING_BODIES
@@ -359,7 +359,7 @@ class MovingBody(NamedTuple):
     near: float  # m, cutoff at which all or half of the near returns are of the body
 
 
-class HandTurn(NamedTuple):
+class _HandTurn(NamedTuple):
     """A camera turned by hand before a stack of parcels, see :func:`dhtorch.synthetic.paths.turn_by_hand`."""
 
     degrees: float
@@ -373,8 +373,8 @@ class Stress(NamedTuple):
 
     options: dict[str, Any]
     spoil: Callable[[StressRoom, int, Frame], Frame] = lambda room, i, frame: frame
-    moving: MovingBody | None = None
-    turn: HandTurn | None = None
+    moving: _MovingBody | None = None
+    turn: _HandTurn | None = None
 
 
 #: Traffic: all that is near moves along the viewer's way, at speeds that rise and fall. Far depths then have a wrong
@@ -393,23 +393,23 @@ STRESSES: dict[str, Stress] = {
     "orbit": Stress({"path": "orbit"}),
     "rotation": Stress({"path": "rotation"}),
     "rotation_exact": Stress({"path": "rotation", "lidar": "exact", "image_noise": 0.0}),
-    "rotation_hand_6": Stress(_TURNED, turn=HandTurn(6.0, 0.02)),
-    "rotation_hand_8": Stress(_TURNED, turn=HandTurn(8.0, 0.03)),
-    "rotation_hand_20": Stress(_TURNED, turn=HandTurn(20.0, 0.03, readout_s=0.0)),
-    "rotation_hand_30": Stress(_TURNED, turn=HandTurn(30.0, 0.03, readout_s=0.0)),
+    "rotation_hand_6": Stress(_TURNED, turn=_HandTurn(6.0, 0.02)),
+    "rotation_hand_8": Stress(_TURNED, turn=_HandTurn(8.0, 0.03)),
+    "rotation_hand_20": Stress(_TURNED, turn=_HandTurn(20.0, 0.03, readout_s=0.0)),
+    "rotation_hand_30": Stress(_TURNED, turn=_HandTurn(30.0, 0.03, readout_s=0.0)),
     "planar_near": Stress({"path": "walk"}, _keep_one_plane),
     "few_near": Stress({"path": "walk"}, _keep_few_returns),
     "depth_noise": Stress({"path": "walk"}, _add_depth_noise),
     "rolling_shutter": Stress({"path": "walk"}),
     "moved": Stress({"path": "walk"}, _displace_tiles),
     "mistracks": Stress({"path": "walk"}),
-    "convoy": Stress({"path": "walk"}, moving=MovingBody("parcels", move_with_viewer, 1.3)),
-    "convoy_slow": Stress({"path": "walk"}, moving=MovingBody("parcels", partial(move_with_viewer, share=0.5), 1.3)),
-    "convoy_oncoming": Stress({"path": "lateral"}, moving=MovingBody("parcels", _ONCOMING, 1.3)),
-    "convoy_uneven": Stress({"path": "walk"}, moving=MovingBody("parcels", _UNEVEN, 1.3)),
-    "convoy_lanes": Stress({"path": "walk"}, moving=MovingBody("parcels", _LANES, 1.3)),
-    "held_object": Stress({"path": "walk"}, moving=MovingBody("held", move_in_hand, 2.0)),
-    "turntable": Stress({"path": "static"}, moving=MovingBody("parcels", turn_on_turntable, 1.3)),
+    "convoy": Stress({"path": "walk"}, moving=_MovingBody("parcels", move_with_viewer, 1.3)),
+    "convoy_slow": Stress({"path": "walk"}, moving=_MovingBody("parcels", partial(move_with_viewer, share=0.5), 1.3)),
+    "convoy_oncoming": Stress({"path": "lateral"}, moving=_MovingBody("parcels", _ONCOMING, 1.3)),
+    "convoy_uneven": Stress({"path": "walk"}, moving=_MovingBody("parcels", _UNEVEN, 1.3)),
+    "convoy_lanes": Stress({"path": "walk"}, moving=_MovingBody("parcels", _LANES, 1.3)),
+    "held_object": Stress({"path": "walk"}, moving=_MovingBody("held", move_in_hand, 2.0)),
+    "turntable": Stress({"path": "static"}, moving=_MovingBody("parcels", turn_on_turntable, 1.3)),
     "fast": Stress({"path": "lateral"}),
     "exposure_jump": Stress({"path": "walk"}),
     "motion_blur": Stress({"path": "walk"}),

@@ -31,7 +31,7 @@ _BINARY_LENSES = dict(zip((0, 1, 2, 3, 4, 6), COLMAP_LENSES, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class ColmapLens:
+class _ColmapLens:
     """A camera of a model."""
 
     hw: tuple[int, int]
@@ -59,7 +59,7 @@ class ColmapImageEntry:
     point: np.ndarray  # (n,) int64, ids of their points, -1 = none
 
 
-def read_colmap_cameras(file: Path) -> dict[int, ColmapLens]:
+def read_colmap_cameras(file: Path) -> dict[int, _ColmapLens]:
     """Camera id → camera, of ``cameras.txt`` or ``cameras.bin``.
 
     Raises:
@@ -71,7 +71,7 @@ def read_colmap_cameras(file: Path) -> dict[int, ColmapLens]:
         focal, (cx, cy), lens = values[:n_focal], values[n_focal : n_focal + 2], values[n_focal + 2 :]
         padded = [*lens, *[0.0] * (4 - len(lens))] if lens else []
         K = convert.make_K(focal[0], focal[-1], cx - 0.5, cy - 0.5)  # pixel centres at integers
-        lenses[number] = ColmapLens((round(h), round(w)), K, tuple(padded) if any(padded) else None)
+        lenses[number] = _ColmapLens((round(h), round(w)), K, tuple(padded) if any(padded) else None)
     return lenses
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError, import_optional, read_bytes
 
 
-class ExrHeader(NamedTuple):
+class _ExrHeader(NamedTuple):
     """Size and channels of an EXR file."""
 
     hw: tuple[int, int]
@@ -59,7 +59,7 @@ def decode_exr(data: bytes, file: Path, channel: str | None = None, hw: tuple[in
     return pixels.astype(np.float32)
 
 
-def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
+def decode_exr_header(data: bytes, file: Path) -> _ExrHeader:
     """Size and channels of an EXR file in memory without decoding it; ``file`` names it in errors.
 
     Raises:
@@ -79,7 +79,7 @@ def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
     h, w = y1 - y0 + 1, x1 - x0 + 1
     if h < 1 or w < 1 or h * w * max(len(channels), 1) > MAX_PIXELS:
         raise FormatError(file, "dataWindow", f"{w}x{h} with {len(channels)} channels", f"1 to {MAX_PIXELS} values")
-    return ExrHeader((h, w), channels)
+    return _ExrHeader((h, w), channels)
 
 
 def _open(data: bytes, *, header_only: bool = False) -> Any:

@@ -25,7 +25,7 @@ from dhtorch.runtime.safe_open import MAX_FILE_BYTES, check_memory, open_regular
 _MAX_HEADER_BYTES = 12_288
 
 
-class NpyHeader(NamedTuple):
+class _NpyHeader(NamedTuple):
     """Shape, order and type of an array, from its header."""
 
     shape: tuple[int, ...]
@@ -34,7 +34,7 @@ class NpyHeader(NamedTuple):
     start: int  # offset of the values
 
 
-def parse_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+def parse_npy_header(file: Path, field: str, head: bytes) -> _NpyHeader:
     """Header of an ``.npy`` file from its first bytes (12 KB suffice), for numbers, texts or pickled objects.
 
     Raises:
@@ -53,10 +53,10 @@ def parse_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
         raise FormatError(file, field, f"{type(error).__name__} {error}", "a numpy array header") from None
     if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= 2**40 for n in shape):
         raise FormatError(file, f"{field} shape", shape, "a few counts")
-    return NpyHeader(shape, bool(fortran), dtype, stream.tell())
+    return _NpyHeader(shape, bool(fortran), dtype, stream.tell())
 
 
-def parse_real_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+def parse_real_npy_header(file: Path, field: str, head: bytes) -> _NpyHeader:
     """As :func:`parse_npy_header`, of real numbers only."""
     header = parse_npy_header(file, field, head)
     if header.dtype.kind not in "fiu" or header.dtype.hasobject:

@@ -28,7 +28,7 @@ _MAX_ROWS = 50_000_000
 _MAX_UNPACKED_BYTES = MAX_MEMORY_BYTES // 4
 
 
-class ParquetHeader(NamedTuple):
+class _ParquetHeader(NamedTuple):
     """Number of rows, column names and row groups of a table, from its footer."""
 
     rows: int
@@ -36,7 +36,7 @@ class ParquetHeader(NamedTuple):
     groups: tuple[int, ...]  # first row of each row group, and the number of rows
 
 
-def read_parquet_header(file: Path) -> ParquetHeader:
+def read_parquet_header(file: Path) -> _ParquetHeader:
     """Rows, columns and row groups of a table; reads only its footer.
 
     Raises:
@@ -119,7 +119,7 @@ def _cached_rows(file: Path, _version: tuple[int, ...], columns: tuple[str, ...]
     return read_columns(file, columns, rows)
 
 
-def _open_table(file: Path) -> tuple[Any, ParquetHeader]:
+def _open_table(file: Path) -> tuple[Any, _ParquetHeader]:
     size = _footer_size(file)
     pyarrow, parquet = import_optional("pyarrow"), import_optional("pyarrow.parquet")
     limits = {"thrift_string_size_limit": size, "thrift_container_size_limit": max(size, 1)}
@@ -133,7 +133,7 @@ def _open_table(file: Path) -> tuple[Any, ParquetHeader]:
     if min(counts, default=0) < 0 or sum(counts) != meta.num_rows or meta.num_rows > _MAX_ROWS:
         raise FormatError(file, "footer", f"{meta.num_rows} rows in groups of {counts[:4]}", f"at most {_MAX_ROWS}")
     starts = np.cumsum([0, *counts]).tolist()
-    return table, ParquetHeader(meta.num_rows, names, tuple(starts))
+    return table, _ParquetHeader(meta.num_rows, names, tuple(starts))
 
 
 def _footer_size(file: Path) -> int:

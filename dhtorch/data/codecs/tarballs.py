@@ -19,7 +19,7 @@ _FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
 _KINDS_WITHOUT_DATA = b"123456"  # links, devices, folders: their declared size is ignored
 
 
-class TarMember(NamedTuple):
+class _TarMember(NamedTuple):
     """A regular file in an archive."""
 
     name: str
@@ -27,7 +27,7 @@ class TarMember(NamedTuple):
     size: int
 
 
-def iter_tar_members(file: Path) -> Iterator[TarMember]:
+def iter_tar_members(file: Path) -> Iterator[_TarMember]:
     """The regular files of an archive, in stored order.
 
     Raises:
@@ -58,7 +58,7 @@ def read_tar_member(file: Path, offset: int, size: int, limit: int = MAX_FILE_BY
     return data
 
 
-def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
+def _iter_headers(file: Path, stream: int) -> Iterator[_TarMember]:
     total, at = os.fstat(stream).st_size, 0
     special: dict[str, str] = {}  # path and size of the next member, from an extra header
     while at + _BLOCK_BYTES <= total:
@@ -89,7 +89,7 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
             special |= _parse_pax(content) if kind == _PAX else {"path": _decode_text(content)}
             continue
         if kind in _FILES:
-            yield TarMember(special.get("path", name), data, size)
+            yield _TarMember(special.get("path", name), data, size)
         elif kind == _SPARSE:
             raise FormatError(file, name, "a sparse member", "plain files")
         special = {}

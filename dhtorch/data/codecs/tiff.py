@@ -20,7 +20,7 @@ _COMPRESSIONS = (1, 5, 8, 32773, 32946)  # none, LZW, deflate, PackBits, deflate
 _TYPES = ("u1", "u2", "u4", "i1", "i2", "i4", "f2", "f4", "f8")
 
 
-class TiffHeader(NamedTuple):
+class _TiffHeader(NamedTuple):
     """Size, samples per pixel and type of the first image."""
 
     hw: tuple[int, int]
@@ -43,7 +43,7 @@ def read_tiff(file: Path, hw: tuple[int, int] | None = None, samples: Sequence[i
     return decode_tiff(read_bytes(file), file, hw, samples)
 
 
-def read_tiff_header(file: Path) -> TiffHeader:
+def read_tiff_header(file: Path) -> _TiffHeader:
     """Size and type of a TIFF file without decoding it.
 
     Raises:
@@ -52,7 +52,7 @@ def read_tiff_header(file: Path) -> TiffHeader:
     return decode_tiff_header(read_bytes(file), file)
 
 
-def decode_tiff_header(data: bytes, file: Path) -> TiffHeader:
+def decode_tiff_header(data: bytes, file: Path) -> _TiffHeader:
     """As :func:`read_tiff_header`, of bytes in memory; ``file`` names them in errors."""
     with _first_page(data, file) as page:
         return _parse_page(page, file)
@@ -111,10 +111,10 @@ def _first_page(data: bytes, file: Path) -> Iterator[Any]:
         log.disabled = was_disabled
 
 
-def _parse_page(page: Any, file: Path) -> TiffHeader:
+def _parse_page(page: Any, file: Path) -> _TiffHeader:
     bits = page.bitspersample
     kind = np.dtype(page.dtype or "V").newbyteorder("=")
     if kind.str[1:] not in _TYPES or bits != 8 * kind.itemsize:
         expected = "8, 16 or 32 bits integer, 16, 32 or 64 floating"
         raise FormatError(file, "samples", f"{bits} bits of kind {page.sampleformat}", expected)
-    return TiffHeader((page.imagelength, page.imagewidth), page.samplesperpixel, kind)
+    return _TiffHeader((page.imagelength, page.imagewidth), page.samplesperpixel, kind)

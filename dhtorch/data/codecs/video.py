@@ -49,7 +49,7 @@ SYMMETRY_OF_MATRIX: Final = {
 }
 
 
-class VideoTrack(NamedTuple):
+class _VideoTrack(NamedTuple):
     """A video track as its container describes it."""
 
     name: str
@@ -58,7 +58,7 @@ class VideoTrack(NamedTuple):
     hw: tuple[int, int]
 
 
-def list_video_tracks(file: Path) -> list[VideoTrack]:
+def list_video_tracks(file: Path) -> list[_VideoTrack]:
     """The video tracks of a file in the order of its header; decodes no frame.
 
     Raises:
@@ -68,7 +68,7 @@ def list_video_tracks(file: Path) -> list[VideoTrack]:
         try:
             contexts = [(stream.metadata.get("title", ""), stream.codec_context) for stream in container.streams.video]
             return [
-                VideoTrack(name, context.name, context.codec_tag.strip("\0"), (context.height, context.width))
+                _VideoTrack(name, context.name, context.codec_tag.strip("\0"), (context.height, context.width))
                 for name, context in contexts
                 if context is not None
             ]
@@ -95,7 +95,7 @@ def read_attachment(file: Path, name: str) -> bytes | None:
     return None
 
 
-class VideoHeader(NamedTuple):
+class _VideoHeader(NamedTuple):
     """Size, number of frames, rate and codec of a video."""
 
     hw: tuple[int, int]  # as stored: a rotation tag is not applied
@@ -106,7 +106,7 @@ class VideoHeader(NamedTuple):
     display: int = 0  # symmetry of the display matrix (an mp4's), see dhtorch.data.orientation; it is not applied
 
 
-def read_video_header(file: Path, *, all_frames: bool = False, track: int = 0) -> VideoHeader:
+def read_video_header(file: Path, *, all_frames: bool = False, track: int = 0) -> _VideoHeader:
     """Size, number of frames and rate of a video; decodes no frame.
 
     Args:
@@ -299,7 +299,7 @@ class _Decoder:
                 raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
             rate = self.stream.average_rate
             pixels = context.pix_fmt or "unknown"
-            self.header = VideoHeader((h, w), n, float(rate) if rate else None, context.name, pixels, self.display)
+            self.header = _VideoHeader((h, w), n, float(rate) if rate else None, context.name, pixels, self.display)
         except self.errors as error:
             self.container.close()
             raise error if isinstance(error, FormatError) else FormatError(file, "header", error, "a video") from None

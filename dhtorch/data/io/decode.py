@@ -41,7 +41,7 @@ _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 MAX_DEFLATE_RATIO = 1032
 
 
-class ImageHeader(NamedTuple):
+class _ImageHeader(NamedTuple):
     """Size, channels, bit depth and EXIF orientation of an image file."""
 
     hw: tuple[int, int]  # as stored
@@ -159,7 +159,7 @@ def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] =
     return depth
 
 
-def read_image_header(file: Path) -> ImageHeader:
+def read_image_header(file: Path) -> _ImageHeader:
     """Size and type of a PNG or JPEG file without decoding it.
 
     Raises:
@@ -168,7 +168,7 @@ def read_image_header(file: Path) -> ImageHeader:
     return decode_image_header(read_bytes(file), file)
 
 
-def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
+def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> _ImageHeader:
     header = decode_image_header(data, file)
     if hw is not None and header.hw != tuple(hw):
         turned = ", another orientation" if header.hw == (hw[1], hw[0]) else ""
@@ -187,12 +187,12 @@ def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageH
     return header
 
 
-def decode_image_header(data: bytes, file: Path) -> ImageHeader:
+def decode_image_header(data: bytes, file: Path) -> _ImageHeader:
     """As :func:`read_image_header`, of bytes in memory; ``file`` names them in errors."""
     if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 33 and data[12:16] == b"IHDR":
         w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
         channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
-        header = ImageHeader((h, w), channels, 8 if colour == 3 else bits, "png", _png_orientation(data))
+        header = _ImageHeader((h, w), channels, 8 if colour == 3 else bits, "png", _png_orientation(data))
     elif data.startswith(b"\xff\xd8"):
         header = _parse_jpeg_header(file, data)
     else:
@@ -207,13 +207,13 @@ def decode_image_header(data: bytes, file: Path) -> ImageHeader:
     return header
 
 
-def _parse_jpeg_header(file: Path, data: bytes) -> ImageHeader:
+def _parse_jpeg_header(file: Path, data: bytes) -> _ImageHeader:
     at, orientation = 2, 1
     while at + 9 < len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             bits, h, w, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
-            return ImageHeader((h, w), channels, bits, "jpeg", orientation)
+            return _ImageHeader((h, w), channels, bits, "jpeg", orientation)
         if marker == _JPEG_APP1 and data[at + 4 : at + 10] == b"Exif\0\0":
             orientation = _parse_exif_orientation(data[at + 10 : at + 2 + length])
         at += 1 if marker == 0xFF else 2 + length

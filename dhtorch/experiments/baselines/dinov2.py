@@ -58,7 +58,7 @@ _OFFICIAL_NAMES = (
 )
 
 
-class Dinov2Weights(NamedTuple):
+class _Dinov2Weights(NamedTuple):
     """Parameters of a network, its sizes as options of ``Dinov2Config``, and where they come from."""
 
     state: dict[str, Tensor]
@@ -71,7 +71,7 @@ class Dinov2Weights(NamedTuple):
         return "embeddings.register_tokens" in self.state
 
 
-def read_dinov2_weights(path: str | Path) -> Dinov2Weights:
+def read_dinov2_weights(path: str | Path) -> _Dinov2Weights:
     """Read DINOv2 weights.
 
     Args:
@@ -110,7 +110,7 @@ def read_dinov2_weights(path: str | Path) -> Dinov2Weights:
     return _weights(_read_tensors(path), path, origin=path.name)
 
 
-def dinov2_from_onnx(path: str | Path) -> Dinov2Weights:
+def dinov2_from_onnx(path: str | Path) -> _Dinov2Weights:
     """The DINOv2 network inside an exported ONNX model, whatever head follows it.
 
     Exporters keep the names of biases and norms, and turn a linear layer's weight into a nameless matrix that is
@@ -194,7 +194,7 @@ def _read_tensors(file: Path) -> dict[str, Tensor]:
     return loaded
 
 
-def _weights(state: Mapping[str, Tensor], file: Path, *, origin: str, heads: int | None = None) -> Dinov2Weights:
+def _weights(state: Mapping[str, Tensor], file: Path, *, origin: str, heads: int | None = None) -> _Dinov2Weights:
     """Parameters under the names of ``transformers``, after a check that they are exactly one network."""
     named = {name.removeprefix("dinov2.").removeprefix("dinov2_with_registers."): x for name, x in state.items()}
     if "patch_embed.proj.weight" in named:
@@ -226,7 +226,7 @@ def _weights(state: Mapping[str, Tensor], file: Path, *, origin: str, heads: int
     for name in _UNUSED:
         named.setdefault(name, torch.zeros(1, width))
     _check_parameters(named, sizes, 1 + side * side, file)
-    return Dinov2Weights(named, sizes, origin)
+    return _Dinov2Weights(named, sizes, origin)
 
 
 def _from_official(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -370,7 +370,7 @@ def register_count(network: torch.nn.Module) -> int:
     return int(getattr(network.config, "num_register_tokens", 0))
 
 
-def _with_weights(weights: Dinov2Weights) -> torch.nn.Module:
+def _with_weights(weights: _Dinov2Weights) -> torch.nn.Module:
     """The network of the sizes and parameters of a file, every one of them set."""
     Config, Model = import_dinov2(registers=weights.has_registers)
     from transformers.utils import logging  # noqa: PLC0415

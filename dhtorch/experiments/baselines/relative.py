@@ -48,7 +48,7 @@ class _PairNetwork:
     def __call__(self, frame_0: Frame, frame_1: Frame) -> "RelativeDepth":
         """Depth of view 0 from B pairs; the frames' own depth is not used."""
         (view_0, gain, shift), (view_1, _, _) = (
-            resize_and_crop(f.image, *self._sizes(*f.hw)) for f in (frame_0, frame_1)
+            _resize_and_crop(f.image, *self._sizes(*f.hw)) for f in (frame_0, frame_1)
         )
         answers = [self._predict(*pair) for pair in zip(view_0.split(1), view_1.split(1), strict=True)]
         depth, confidence = (torch.cat(x).to(frame_0.camera.f) for x in zip(*answers, strict=True))
@@ -187,7 +187,7 @@ class ConstantDepth:
         return RelativeDepth(ones, 2 * ones, torch.zeros_like(like), torch.zeros_like(like))
 
 
-def resize_and_crop(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def _resize_and_crop(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Image resized to ``hw`` and cropped to ``crop_hw`` around its centre, with the transform of its pixels.
 
     Args:

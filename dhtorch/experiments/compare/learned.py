@@ -56,7 +56,7 @@ DepthNetwork = Callable[[Frame, Frame], RelativeDepth]
 
 
 @record
-class NetworkScale(Record):
+class _NetworkScale(Record):
     """Metres per unit of a network."""
 
     factor: Tensor  # (B,); NaN where too few pixels determine it
@@ -109,9 +109,9 @@ def run(
     variants = {ours: Variant(method)}
     labels: dict[str, Row] = {ours: {"scale": "sensor", "metric": "yes", **memory.count_weights(method)}}
     for name, network in networks.items():
-        cached = CachedNetwork(network)
+        cached = _CachedNetwork(network)
         for scale in scales:
-            estimate = partial(estimate_with_network, network=cached, scale_pixels=scale_pixels)
+            estimate = partial(_estimate_with_network, network=cached, scale_pixels=scale_pixels)
             scale_options = partial(_scale_reference, scale=scale, seed=settings.seed)
             variants[f"{name}_{scale}"] = Variant(method, estimate=estimate, call_options=scale_options)
             labels[f"{name}_{scale}"] = {
@@ -139,7 +139,7 @@ def run(
     )
 
 
-class CachedNetwork:
+class _CachedNetwork:
     """Network with a cache of its last pair of images, for all scales; keeps the milliseconds of the forward pass."""
 
     def __init__(self, network: DepthNetwork) -> None:
@@ -158,12 +158,12 @@ class CachedNetwork:
         return self._answer
 
 
-def estimate_with_network(
+def _estimate_with_network(
     method: Method,
     near: Frame,
     other: Frame,
     *,
-    network: CachedNetwork,
+    network: _CachedNetwork,
     scale_pixels: int,
     known: Frame,
     seed: int,
@@ -182,7 +182,7 @@ def estimate_with_network(
     return to_estimate(relative, samples.uv, scale.factor)
 
 
-def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> NetworkScale:
+def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> _NetworkScale:
     """Metres per unit: median ratio of known to relative depth over pixels that no sample reads.
 
     Image pixels are drawn from the seed, the same for all pairs. One whose pixel of the depth map lies within the
@@ -214,7 +214,7 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
     ratio = torch.where(use, true_depth / torch.where(use, depth, torch.ones_like(depth)), torch.nan)
     count = use.sum(-1)
     factor = ratio.nanmedian(-1).values
-    return NetworkScale(torch.where(count >= _MIN_SCALE_PIXELS, factor, torch.full_like(factor, torch.nan)), count)
+    return _NetworkScale(torch.where(count >= _MIN_SCALE_PIXELS, factor, torch.full_like(factor, torch.nan)), count)
 
 
 def verdict(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:

@@ -142,12 +142,12 @@ def run(
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     variants = {
-        seed_variant_name(name, k): _make_variant(method, settings.seed + k, pairs if name in fallback else None)
+        _seed_variant_name(name, k): _make_variant(method, settings.seed + k, pairs if name in fallback else None)
         for name, method in methods.items()
         for k in range(seeds if name in (reference, *compared) else 1)
     }
     variants |= {
-        f"{name}, gap {gap}": Variant(methods[name], offers=partial(view_at_gap, gap=gap))
+        f"{name}, gap {gap}": Variant(methods[name], offers=partial(_view_at_gap, gap=gap))
         for name, gap in product(compared[:1], gaps)
     }
     variants |= {
@@ -160,21 +160,21 @@ def run(
         _join_halves(outcome, name)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
     with_role = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
-    all_points = {name: points_by_seed(outcome, name, seeds) for name in (reference, *compared)}
+    all_points = {name: _points_by_seed(outcome, name, seeds) for name in (reference, *compared)}
     points_of = {
         name: {s: p for s, p in scene_points.items() if s not in with_role} for name, scene_points in all_points.items()
     }
     complete = compare.complete_scenes(points_of, reference, fallback)
     comparison = compare.method_ratios(complete, reference=reference, rooms=rooms, exact=exact, floors=floors)
     for name in (reference, *compared):
-        seeds_of = [seed_variant_name(name, k) for k in range(seeds)]
+        seeds_of = [_seed_variant_name(name, k) for k in range(seeds)]
         outcome.summary |= compare.rotation_answered(outcome.rows, seeds_of, outcome.cohort)
-    keep_first_seed(outcome, methods, seeds)
+    _keep_first_seed(outcome, methods, seeds)
     outcome.summary |= comparison.summary
     agreement: Row = {}
     known = {name: other for name, other in (ratios or {}).items() if {name, other} <= methods.keys()}
     for name, other in {**dict.fromkeys(twins, reference), **known}.items():
-        one, two = (points_by_seed(outcome, n, 1, apart=with_role) for n in (name, other))
+        one, two = (_points_by_seed(outcome, n, 1, apart=with_role) for n in (name, other))
         numbers = {f"{name}.{k}": v.entry("1") for k, v in compare.twin_ratios(one, two, other).items()}
         agreement |= {k: v for k, v in numbers.items() if name in twins and "equal" not in k}
         outcome.summary |= numbers
@@ -242,7 +242,7 @@ def verdict(
     return not missed, "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
 
 
-def view_at_gap(recording: Recording, reference: int, *, gap: int) -> list[int]:
+def _view_at_gap(recording: Recording, reference: int, *, gap: int) -> list[int]:
     """[Position of the frame ``gap`` numbers after the reference view, or else before it]; empty without either."""
     for step in (gap, -gap):
         positions: list[int] = (recording.number == recording.number[reference] + step).nonzero()[:, 0].tolist()
@@ -322,23 +322,23 @@ def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Varian
     return Variant(method, seed=seed, offers=offers, needs=skip_reason)
 
 
-def seed_variant_name(method: str, k: int) -> str:
+def _seed_variant_name(method: str, k: int) -> str:
     """Name of the variant of a method with seed ``k``; that of the first seed is the method's own name."""
     return method if k == 0 else f"{method}, seed {k}"
 
 
-def keep_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
+def _keep_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
     """Remove the later seeds from the rows and the summary; their points remain."""
-    later = {seed_variant_name(name, k) for name in methods for k in range(1, seeds)}
+    later = {_seed_variant_name(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
 
 
-def points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
+def _points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
     """Scene → candidates of every seed, without the scenes in ``apart``."""
     scenes: dict[str, list[Points]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
-            if (variant, cohort) == (seed_variant_name(method, k), outcome.cohort) and scene not in apart:
+            if (variant, cohort) == (_seed_variant_name(method, k), outcome.cohort) and scene not in apart:
                 scenes.setdefault(scene, []).append(points)
     return scenes

@@ -90,7 +90,7 @@ PIN_BARS: Bars = {
 PlantedMove = tuple[Row, Pose, Frame]
 
 
-def render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int = 2) -> list[PlantedMove]:
+def _render_scene(kind: str, seed: int, hw: tuple[int, int], *, supersample: int = 2) -> list[PlantedMove]:
     """Images of a camera in the room of a seed, the reference first: views of the ``room``, or at a ``robot``."""
     draw = Random(f"pin {kind} {seed}")
     if kind == "robot":
@@ -133,11 +133,11 @@ def _draw_move(kind: str, size: float, depth: Tensor, camera: Camera, draw: Rand
     part, scale = draw.uniform(0.2, 0.8), size
     xi = torch.cat((part * turn, (1 - part) * float(depth.median()) * shift))[None] / float(camera.f.mean())
     for _ in range(6):
-        scale *= size / max(median_flow(se3.exp(scale * xi), depth, camera), 1e-9)
+        scale *= size / max(_median_flow(se3.exp(scale * xi), depth, camera), 1e-9)
     return se3.exp(scale * xi)
 
 
-def median_flow(T_ref_from_live: Pose, depth: Tensor, camera: Camera) -> float:
+def _median_flow(T_ref_from_live: Pose, depth: Tensor, camera: Camera) -> float:
     """Median motion, px, of the points of a depth map (1, H, W) of the reference in the live picture."""
     H, W = depth.shape[-2:]
     v, u = torch.meshgrid(torch.arange(0, H, 8), torch.arange(0, W, 8), indexing="ij")
@@ -148,7 +148,7 @@ def median_flow(T_ref_from_live: Pose, depth: Tensor, camera: Camera) -> float:
     return float((moved - uv).norm(dim=-1).median())
 
 
-def live_images(scene: str, images: Sequence[PlantedMove], draws: int) -> Iterator[PlantedMove]:
+def _live_images(scene: str, images: Sequence[PlantedMove], draws: int) -> Iterator[PlantedMove]:
     """Every rendered image, taken again ``draws`` times with other exposure, noise and arms; the row states the hidden
     fraction."""
     for row, T, rendered in images:
@@ -199,17 +199,17 @@ def run(
     times: list[dict[str, float]] = []
     places = [*(("room", seed) for seed in rooms), *(("robot", seed) for seed in robots)]
     for kind, seed in progress(places, "scenes", len(places)):
-        scene, images = f"{kind}_{seed}", render_scene(kind, seed, (hw[0], hw[1]))
+        scene, images = f"{kind}_{seed}", _render_scene(kind, seed, (hw[0], hw[1]))
         # the reference with arms over a part of it, as a robot stands in its camera's view
         draw = Random(f"{scene} reference")
         reference, _ = hide_behind_arms(images[0][2], _REFERENCE_SHARE, arm_seed=0, draw=draw)
         pin = CameraPin(reference, seed=settings.seed)
-        outcome.rows += [_image_row(scene, pin, *image) for image in live_images(scene, images, draws)]
+        outcome.rows += [_image_row(scene, pin, *image) for image in _live_images(scene, images, draws)]
         times.append(_time_ratio(scene, images, pin))
         outcome.n_pairs = len(outcome.rows)
     if real:
         outcome.rows += _real_rows(scenes_root(root))
-    outcome.summary = summarise_pin(outcome.rows, times)
+    outcome.summary = _summarise_pin(outcome.rows, times)
     return outcome.decide(
         "Does a reference view tell whether its camera was moved, and by how much?",
         "Every number of the list of bars is met; scenes are the unit of fractions.",
@@ -279,7 +279,7 @@ def _spread_frames(recording: Recording, n: int) -> list[Frame]:
     return [recording[k * len(recording) // n] for k in range(n)]
 
 
-def summarise_pin(rows: Sequence[Row], times: Sequence[Mapping[str, float]]) -> Row:
+def _summarise_pin(rows: Sequence[Row], times: Sequence[Mapping[str, float]]) -> Row:
     """Rows -> summary: key -> value, with its interval over scenes where it is a fraction of pictures."""
     planted = [row for row in rows if row["method"] == "pin"]
     scenes = sorted({row["scene"] for row in planted})

@@ -127,7 +127,7 @@ def run(
         case = _open(Scene(room), room_frames) if isinstance(source, int) else _open(source, max_frames)
         outcome.rows += _study(name, case, near_limits, sizes, (sound, repeats), settings.seed)
         outcome.n_pairs += len(case.frames)
-    outcome.summary = summarise_scales(outcome.rows)
+    outcome.summary = _summarise_scales(outcome.rows)
     return outcome.decide(
         "Is the size right at three times the sensor's range, with a sigma that holds, and is a bent model refused?",
         "Error at three times the range <= 1 %; within 2 sigma >= 92 %; bent or drifting by >= 3 % refused >= 95 %, "
@@ -324,17 +324,17 @@ def _study(
     """Rows of one scene; ``limits`` and ``counts`` are those of sound and of faulty models."""
     rows, (sound, repeats) = [], counts
     for kind in ("maps", "points"):
-        results = [measure_scale(scene, kind, None, 0.0, limits[0], _seed(seed, name, kind, k)) for k in range(sound)]
+        results = [_measure_scale(scene, kind, None, 0.0, limits[0], _seed(seed, name, kind, k)) for k in range(sound)]
         rows.append(_row(name, kind, None) | _mean_row(results))
         if limits[1] != limits[0]:
             results = [
-                measure_scale(scene, kind, None, 0.0, limits[1], _seed(seed, name, k, kind)) for k in range(sound)
+                _measure_scale(scene, kind, None, 0.0, limits[1], _seed(seed, name, k, kind)) for k in range(sound)
             ]
             rows.append(_row(name, kind, "sound, faults' range") | _mean_row(results))
         for fault in FAULTS:
             for size in sizes:
                 results = [
-                    measure_scale(scene, kind, fault, size, limits[1], _seed(seed, name, kind, fault, size, k))
+                    _measure_scale(scene, kind, fault, size, limits[1], _seed(seed, name, kind, fault, size, k))
                     for k in range(repeats)
                 ]
                 rows.append(_row(name, kind, f"{fault} {size:g}") | _mean_row(results))
@@ -346,7 +346,7 @@ def _seed(*parts: object) -> int:
     return int.from_bytes(repr(parts).encode(), "little") % (2**61 - 1)
 
 
-def measure_scale(scene: ScaleScene, kind: str, fault: str | None, size: float, near: float, seed: int) -> Row:
+def _measure_scale(scene: ScaleScene, kind: str, fault: str | None, size: float, near: float, seed: int) -> Row:
     """One model of a scene -> its error of scale, that at three times the near limit, and whether it is refused."""
     draw = np.random.default_rng([seed, 1])
     sensor = SENSORS["iphone_lidar"] if scene.is_exact else _EXACT_SENSOR
@@ -397,7 +397,7 @@ def _mean_row(results: Sequence[Row]) -> Row:
     return row
 
 
-def summarise_scales(rows: Sequence[Row]) -> Row:
+def _summarise_scales(rows: Sequence[Row]) -> Row:
     """Scene rows → the numbers of :data:`SCALE_BARS`, and refusals and errors of every kind of model and fault."""
     rows = [row for row in rows if "refused" in row]
     scenes = sorted({row["scene"] for row in rows})

@@ -84,7 +84,7 @@ def run(
     estimated and true inverse depth; ``side_right``, fraction of pixels with the correct side; ``blur_corr``, Pearson
     of measured and true blur; ``texture_corr``, Pearson of measured blur and the blur measured without a lens;
     ``rho_perfect``, ``rho_abs`` of the true blur; ``coverage``, fraction of the candidates with edges. The summary has
-    the two ambiguities as ``blank_wall.*`` and ``two_sides.*``, see :func:`measure_ambiguities`.
+    the two ambiguities as ``blank_wall.*`` and ``two_sides.*``, see :func:`_measure_ambiguities`.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. The first
@@ -128,7 +128,7 @@ def run(
         progress=progress,
     )
     outcome.summary |= {
-        k: bootstrap.without_interval(v, 1) for k, v in measure_ambiguities(noise=noise, window_px=window_px).items()
+        k: bootstrap.without_interval(v, 1) for k, v in _measure_ambiguities(noise=noise, window_px=window_px).items()
     }
     return outcome.decide(
         "How much depth is there in the defocus of a single picture?",
@@ -168,7 +168,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     ] < _MAX_KEPT_RATIO * oracle, why
 
 
-def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
+def _measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
     """Measure the two ambiguities of a single image, texture and side of the focus, on a rendered fronto-parallel wall.
 
     Returns:

@@ -93,7 +93,7 @@ def run(
     Rows, per scene: over the pixels of a grid with depth, ``rank_corr`` (Spearman) and ``corr`` (Pearson) of estimated
     and true inverse depth, ``gated_corr`` over the most confident quarter, ``abs_corr`` and ``gated_abs_corr`` their
     absolute values, ``flip_share`` 1 if Spearman is negative (its mean for a scene and in the summary), ``median_rel``
-    of depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`measure_without_truth`.
+    of depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`_measure_without_truth`.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`; recordings with exact depth
@@ -127,7 +127,7 @@ def run(
             stack = scene.stacks[item[0]].to(settings.dtype).to(settings.device)
             if stack.depth is None or stack.focus_m is None:
                 order = slice(None) if stack.focus_m is None else stack.focus_m[0].argsort()
-                return measure_without_truth(stack.replace(images=stack.images[:, order]), measures[0], window_px)
+                return _measure_without_truth(stack.replace(images=stack.images[:, order]), measures[0], window_px)
             order = stack.focus_m[0].argsort()  # from near to far
             images = stack.images[:, order]
             conditions = {"given": images, "given_aligned": align_stack(images)[0]}
@@ -135,7 +135,7 @@ def run(
         frame = scene.recording[0].to(settings.dtype).to(settings.device)
         steps = torch.linspace(1 / _FOCUS_RANGE_M[0], 1 / _FOCUS_RANGE_M[1], slices, dtype=settings.dtype)
         lens = {"focal_length_m": focal_length_m, "f_number": f_number}
-        return evaluate_stack(render_stacks(frame, 1 / steps[None], lens, settings.seed), 1 / steps[None], frame.depth)
+        return evaluate_stack(_render_stacks(frame, 1 / steps[None], lens, settings.seed), 1 / steps[None], frame.depth)
 
     rooms = [room for source in scenes for room in _group_rooms(source, max_stacks)]
     names = [
@@ -200,7 +200,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     )
 
 
-def render_stacks(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed: int) -> dict[str, Tensor]:
+def _render_stacks(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed: int) -> dict[str, Tensor]:
     """Render the grey stacks (1, S, 1, H, W) of every condition from a frame with exact depth."""
     sharp = filters.grayscale(frame.image)
     generator, count = torch.Generator().manual_seed(seed), focus_m.shape[1]
@@ -236,7 +236,7 @@ def render_stacks(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed
     }
 
 
-def measure_without_truth(stack: FocalStack, measure: str, window_px: float) -> dict[str, Row]:
+def _measure_without_truth(stack: FocalStack, measure: str, window_px: float) -> dict[str, Row]:
     """Measures of a sweep without ground truth depth, as recorded and aligned: condition → row.
 
     ``order_corr``: |Spearman| of the order of the images with the order estimated from sharpness (neighbours in a sweep

@@ -145,11 +145,11 @@ def _recognise_images(root: Path) -> str | None:
     names = [place.name for place in (resolved, *resolved.parents)][:_N_NAMED_FOLDERS]
     names += sorted(file.name for file in _image_files(root))[:1]
     named = next((name for name in names if _STACK_PATTERN.match(name)), None)
-    images = None if named is None else describe_images(root)
+    images = None if named is None else _describe_images(root)
     return None if images is None else f"{images}, named {named}"
 
 
-def describe_images(root: Path) -> str | None:
+def _describe_images(root: Path) -> str | None:
     """Text on the images of ``root`` where they can be a stack of this format; None where they cannot."""
     if any((root / name).is_dir() for name in _DEPTH_FOLDERS) or list_camera_files(root):
         return None  # an RGB-D recording, or a moving camera
@@ -239,7 +239,7 @@ def survey_stacks(stacks: FocalStacks, shown: int = 8) -> Survey:
     return out
 
 
-class StackReader(NamedTuple):
+class _StackReader(NamedTuple):
     """Functions of a format."""
 
     recognise: Callable[[Path], str | None]  # folder or file → text of the evidence for the format; None without
@@ -247,10 +247,10 @@ class StackReader(NamedTuple):
 
 
 #: Name → reader, tried in this order; the first that recognises a folder reads it.
-STACK_FORMATS: Final[dict[str, StackReader]] = {
-    "fod500": StackReader(_recognise_fod500, read_fod500),
-    "ddff12": StackReader(ddff12.recognise, ddff12.read),
-    "images": StackReader(_recognise_images, read_images),
+STACK_FORMATS: Final[dict[str, _StackReader]] = {
+    "fod500": _StackReader(_recognise_fod500, read_fod500),
+    "ddff12": _StackReader(ddff12.recognise, ddff12.read),
+    "images": _StackReader(_recognise_images, read_images),
 }
 
 
@@ -301,7 +301,7 @@ def recognise_stacks(root: str | Path, *, follow_links: bool = False, are_stacks
         for name, reader in STACK_FORMATS.items():
             if evidence := reader.recognise(Path(root)):
                 return name, evidence
-        if are_stacks and (evidence := describe_images(Path(root))):
+        if are_stacks and (evidence := _describe_images(Path(root))):
             return "images", evidence
     raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
 

@@ -22,7 +22,7 @@ SHARPNESS_MEASURES = ("modified_laplacian", "gradient_energy", "variance")
 
 
 @record
-class FocusMap(Record):
+class _FocusMap(Record):
     """Fractional index of the sharpest image at every pixel, with a confidence."""
 
     place: Tensor  # (B, H, W) index in the stack, in [0, S − 1]
@@ -71,7 +71,7 @@ def measure_sharpness(
 
 def find_sharpest(
     measured: Tensor,  # (B, S, H, W) not negative
-) -> FocusMap:
+) -> _FocusMap:
     """Index of the sharpest image of every pixel, refined between images by a Gaussian through three values.
 
     Confidence is 1 − mean / peak: 0 for equal sharpness in all images, at most 1 − 1 / S. A peak at the first or the
@@ -98,7 +98,7 @@ def find_sharpest(
     confidence = torch.where(
         has_peak, 1 - mean / torch.where(has_peak, peak, torch.ones_like(peak)), torch.zeros_like(peak)
     )
-    return FocusMap((best + shift.clamp(-0.5, 0.5))[:, 0], confidence[:, 0])
+    return _FocusMap((best + shift.clamp(-0.5, 0.5))[:, 0], confidence[:, 0])
 
 
 def depth_at_focus(

@@ -55,7 +55,7 @@ _FLAT_VARIANCE = 1e-6
 
 
 @record
-class ArmShift(Record):
+class _ArmShift(Record):
     """Shift of the window around each site along the arm, with its correlation."""
 
     lag: Tensor  # (B, K) steps along the arm; 0 where not valid
@@ -110,7 +110,7 @@ def correlate_windows(
     window: int = 41,
     max_lag: int = 40,
     min_peak: float = 0.5,
-) -> ArmShift:
+) -> _ArmShift:
     """Windowed normalised cross-correlation of two signals, its highest peak refined between steps by a parabola.
 
     Args:
@@ -155,7 +155,7 @@ def correlate_windows(
     ends = torch.maximum(score.detach()[..., 0], score.detach()[..., -1])
     valid = inside & textured & (ends <= peak) & (peak >= min_peak)
     zero = torch.zeros_like(peak)
-    return ArmShift(torch.where(valid, best - max_lag + offset, zero), torch.where(valid, peak, zero), valid)
+    return _ArmShift(torch.where(valid, best - max_lag + offset, zero), torch.where(valid, peak, zero), valid)
 
 
 def _read_windows(signal: Tensor, start: Tensor, length: int) -> Tensor:
@@ -197,7 +197,7 @@ _SAME_SHIFT_PX = 2.0
 _POINTS_PER_STEP = 4
 
 
-class SpiralArm(NamedTuple):
+class _SpiralArm(NamedTuple):
     """Spiral arm as a curve of points 1 px apart."""
 
     uv: Tensor  # (L, 2) px
@@ -301,7 +301,7 @@ def make_arms(
     foveation: float = 1.0,
     gaze: tuple[float, float] | None = None,
     round_arms: bool = False,
-) -> tuple[SpiralArm, SpiralArm]:
+) -> tuple[_SpiralArm, _SpiralArm]:
     """The two arms of a spiral of ``n`` points as curves of points 1 px apart; circular with ``round_arms``."""
     turns = turns or math.sqrt(foveation * n / (2 * math.pi))
     total = int(_POINTS_PER_STEP * turns * math.pi * math.hypot(*hw)) & ~1
@@ -317,7 +317,7 @@ def make_arms(
     )
 
 
-def _resample_evenly(uv: Tensor, turn: Tensor, like: Tensor) -> SpiralArm:
+def _resample_evenly(uv: Tensor, turn: Tensor, like: Tensor) -> _SpiralArm:
     """Resample a dense curve (M, 2) at steps of 1 px."""
     length = torch.cat((uv.new_zeros(1), uv.diff(dim=0).norm(dim=-1).cumsum(0)))
     position = torch.arange(int(length[-1]), dtype=torch.float64)
@@ -326,7 +326,7 @@ def _resample_evenly(uv: Tensor, turn: Tensor, like: Tensor) -> SpiralArm:
     even = uv[after - 1] + weight * (uv[after] - uv[after - 1])
     (tangent,) = torch.gradient(even, dim=0)
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    return SpiralArm(*(x.to(like) for x in (even, tangent, turn[after - 1])))
+    return _SpiralArm(*(x.to(like) for x in (even, tangent, turn[after - 1])))
 
 
 def _evaluate_pair(
@@ -386,7 +386,7 @@ def _correlate_arms(
     site = target = sites[a]
     if a != b:
         target = torch.searchsorted(arms[b].turn, arms[a].turn[site] + step).clamp_max(len(arms[b].turn) - 1)
-    shift: ArmShift = correlate(signals[0][a], signals[1][b], site[None], target[None])
+    shift: _ArmShift = correlate(signals[0][a], signals[1][b], site[None], target[None])
     curve = arms[b].uv
     position = (target + shift.lag[0]).clamp(0, len(curve) - 1)
     low = position.floor().long().clamp_max(len(curve) - 2)

@@ -55,7 +55,7 @@ _MIN_MATCHES = 6
 
 
 @record
-class IcpRegistration(Record):
+class _IcpRegistration(Record):
     """Relative pose of two point sets, with matches, residual and conditioning."""
 
     T_1_from_0: Pose
@@ -77,7 +77,7 @@ def register_icp(
     least_reach_m: float = 0.1,
     keep: float = 0.8,
     iterations: int = 30,
-) -> IcpRegistration:
+) -> _IcpRegistration:
     """Register set 0 to set 1 by trimmed ICP from an initial pose: points, initial pose -> registration.
 
     Every iteration matches each point with its nearest, keeps the best matches and takes one Gauss–Newton step, which
@@ -132,7 +132,7 @@ def register_icp(
     share = n / sets.valid_0.sum(-1).clamp_min(1)
     pose = select_batch(ok, T, start).to(xyz_0.dtype)
     share, rms, condition = (v.to(xyz_0.dtype) for v in (share, rms, condition))
-    return IcpRegistration(pose, matched, share, rms, condition, ok)
+    return _IcpRegistration(pose, matched, share, rms, condition, ok)
 
 
 def estimate_normals(
@@ -414,7 +414,7 @@ class _Chain:
 
     def refine(
         self, item: ScreenedItem, start: Pose, solver: str, reach: float, least: float
-    ) -> IcpRegistration | None:
+    ) -> _IcpRegistration | None:
         """ICP registration of a link from a start; None without a solver."""
         if not solver:
             return None
@@ -463,7 +463,7 @@ class _Chain:
         }
 
 
-def _evaluate_link(chain: _Chain, item: ScreenedItem, T: Pose, fit: IcpRegistration | None, confident: bool) -> Row:
+def _evaluate_link(chain: _Chain, item: ScreenedItem, T: Pose, fit: _IcpRegistration | None, confident: bool) -> Row:
     """Row of a link: pose error, confidence, and the evidence of ICP."""
     angle, distance = _pose_difference(T, chain.relative(item, true=True))
     row: Row = {"rotation_deg": angle, "translation_m": distance, "translation_rel": distance / chain.scale}

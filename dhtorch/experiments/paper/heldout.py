@@ -72,7 +72,7 @@ def run(
         part = run_protocol(scenes, heldout_protocol, pairs, settings, progress=progress)
         scene_rows = [r for r in part.rows if r["pair"] is None and (r["method"], r["truth"]) == (name, "heldout")]
         for row in scene_rows:
-            row["passes"] = passes_strict_line(row)
+            row["passes"] = _passes_strict_line(row)
         counted = [row["passes"] for row in scene_rows if row["role"] is None]
         for key, value in (("n_passes", sum(counted)), ("n_scenes", len(counted))):
             part.summary[f"{name}.{key}"] = bootstrap.without_interval(value, len(counted), "count")
@@ -98,7 +98,7 @@ def recovery_columns(split: HeldOut, answer: Answer) -> Row:
     return columns
 
 
-def passes_strict_line(row: Mapping[str, Any]) -> bool:
+def _passes_strict_line(row: Mapping[str, Any]) -> bool:
     """Whether a scene passes the strict line; one with fewer than 10 answers does not."""
     numbers = [row.get(k) for k in ("corr", "median_rel", "residual_px")]
     if row.get("n_kept", 0) < _MIN_ANSWERS or any(v is None for v in numbers):

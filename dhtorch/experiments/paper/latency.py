@@ -135,8 +135,8 @@ def run(
     for hw in sizes:
         frame_0, frame_1 = (_resample_frame(view, (hw[0], hw[1])) for view in views)
         timed: list[tuple[str, Callable[[], Any], int]] = [
-            ("front_end", partial(run_front_end, method, frame_0, n), front_end_repeats),
-            ("pair", partial(run_pair, partial(method, n=n, **options), frame_0, frame_1), pair_repeats),
+            ("front_end", partial(_run_front_end, method, frame_0, n), front_end_repeats),
+            ("pair", partial(_run_pair, partial(method, n=n, **options), frame_0, frame_1), pair_repeats),
         ]
         for stage, call, repeats in timed:
             resources = memory.count_weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
@@ -162,19 +162,19 @@ def run(
     )
 
 
-def run_front_end(method: Method, frame: Frame, n: int) -> Samples:
+def _run_front_end(method: Method, frame: Frame, n: int) -> Samples:
     """Stages 1 to 3 of a method (sample, backproject, classify): the front end that the paper times."""
     return method.replace(n=n).sample_depth(frame)
 
 
-def run_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
+def _run_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
     """All seven stages of a method on a pair → milliseconds of each."""
     trace: Trace = {}
     method(frame_0, frame_1, trace=trace)
     return dict(trace["ms"])
 
 
-def run_forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
+def _run_forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
     """Build the network and run one forward pass, for the peak memory of a process with nothing else."""
     with torch.no_grad():
         make()(pixel_values=pixels)
@@ -221,7 +221,7 @@ def _make_visual_branch(
     side = make.keywords.get("side", 224) if isinstance(make, partial) else 224
     pixels = visual.preprocess_image(frame.image, side).to(settings.dtype)
     # Before this process loads the network, so that there is memory for both.
-    peak_memory = _peak_mib(partial(run_forward, make, pixels), settings, peak, visual.import_dinov2)
+    peak_memory = _peak_mib(partial(_run_forward, make, pixels), settings, peak, visual.import_dinov2)
     network = make().to(settings.device, settings.dtype)
 
     def call() -> None:

@@ -109,7 +109,7 @@ def run(
         ValueError: a scene that is no LeRobot set or has no poses, or fewer than three blocks or streams.
     """
     networks, origin = front_ends.load_network_front_ends(dinov2, cells=dinov2_cells, device=settings.device)
-    extract = partial(extract_features, readings=readings, networks=networks, settings=settings, cells=depth_cells)
+    extract = partial(_extract_features, readings=readings, networks=networks, settings=settings, cells=depth_cells)
     outcome = Outcome(metrics=PROBE_METRICS)
     samples = [(s, split_into_samples(s, gap_parts, blocks, min_samples)) for s in scenes_of(scenes)]
     errors_by_split: dict[str, ProbeErrors] = {}
@@ -153,7 +153,7 @@ def split_into_samples(scene: Scene, gap_parts: int, blocks: int, min_samples: i
     return [part for part in parts if part]
 
 
-def extract_features(
+def _extract_features(
     scene: Scene,
     block: Sequence[tuple[int, int, int]],
     *,

@@ -148,7 +148,7 @@ def patch_tokens(
 
 
 @torch.no_grad()
-def dense_features(
+def _dense_features(
     network: torch.nn.Module,
     frames: Sequence[Frame],
     others: Sequence[Frame] | None = None,
@@ -187,7 +187,7 @@ def load_network_front_ends(
         front_ends["dinov2"] = partial(patch_tokens, network, cells=cells, side=options.get("side", 224))
         origin = None if options.get("weights") is None else dinov2.describe_weights(network)
     if xfeat_too:
-        front_ends["xfeat"] = partial(dense_features, xfeat.load_xfeat(device).net)
+        front_ends["xfeat"] = partial(_dense_features, xfeat.load_xfeat(device).net)
     if efficientnet_too:
         network = efficientnet.load_efficientnet(device)
         front_ends["efficientnet"] = partial(efficientnet.map_features, network, cells=cells)

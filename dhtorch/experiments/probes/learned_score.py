@@ -109,7 +109,7 @@ def run(
         for score, make_options in options_by_score.items()
     }
     outcome = run_protocol(scenes, Protocol(variants), pairs, settings, progress=progress)
-    ratios = compare_scores(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
+    ratios = _compare_scores(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
     outcome.summary |= {k: v.entry() for k, v in ratios.items()}
     if save is not None and answers.labelled():
         scorer = train_score(list(answers.labelled().values()), **options)
@@ -181,7 +181,7 @@ def label_answers(trace: Trace, true_depth: Tensor, counts: Tensor) -> LabelledA
     return LabelledAnswers(x[used], ((trace["estimate"].depth - true_depth).abs() / true_depth)[used])
 
 
-def compare_scores(outcome: Outcome, apart: set[str]) -> dict[str, bootstrap.Interval]:
+def _compare_scores(outcome: Outcome, apart: set[str]) -> dict[str, bootstrap.Interval]:
     """Geometric means over scenes of AURC ratios; scenes in ``apart`` and those with few answers are left out."""
     seeds: dict[str, dict[str, list[Any]]] = {}
     for (scene, variant, cohort), points in outcome.points.items():

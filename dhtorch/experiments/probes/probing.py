@@ -313,9 +313,9 @@ def evaluate_probes(
             squares = {}
             for arm, (index, linear, _) in fitted.items():
                 prediction = probe.predict_targets(linear, shard.features()[:, index])[0]
-                squares[arm] = scaled_squared_error(prediction, shard.target, scale)
+                squares[arm] = _scaled_squared_error(prediction, shard.target, scale)
             squares |= {
-                arm: scaled_squared_error(shard.blocks[block], shard.target, scale)
+                arm: _scaled_squared_error(shard.blocks[block], shard.target, scale)
                 for arm, block in predictions.items()
             }
             finite = torch.stack([squared.isfinite() for squared in squares.values()]).all(0)
@@ -326,7 +326,7 @@ def evaluate_probes(
     return errors_by_arm
 
 
-def scaled_squared_error(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+def _scaled_squared_error(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
     """Squared errors (…, n) of predictions (…, n, D) in units of ``scale`` (D,), mean over the targets."""
     return ((answer.double() - target.double()) / scale).square().mean(-1)
 
@@ -369,7 +369,7 @@ def _choose_penalties(
     total = torch.zeros(len(penalties), dtype=torch.float64)
     for shard in shards.read(fold.choose):
         prediction = probe.predict_targets(linear, shard.features()[:, index])
-        total += scaled_squared_error(prediction, shard.target, scale).nan_to_num(0.0).sum(-1)
+        total += _scaled_squared_error(prediction, shard.target, scale).nan_to_num(0.0).sum(-1)
     best = slice(k := int(total.argmin()), k + 1)
     return index, linear[best], penalties[k].tolist()
 

@@ -327,7 +327,7 @@ def _reliability(result: Result) -> Figure | None:
     strokes = assign_strokes(variant_names(result))
     figure, panels = make_figure(len(curves))
     for axes, variant in zip(panels, (v for v in strokes if v in curves), strict=True):
-        claimed, realised, weight = pool_reliability(curves[variant])
+        claimed, realised, weight = _pool_reliability(curves[variant])
         edges = np.linspace(0, 1, len(weight) + 1)
         axes.bar(edges[:-1] + 0.01, weight, np.diff(edges) - 0.02, align="edge", color=FAINT)
         draw_line(axes, [0.0, 1.0], [0.0, 1.0], Stroke(SOFT, 1.0, (4, 3)))
@@ -342,7 +342,7 @@ def _reliability(result: Result) -> Figure | None:
     return Figure("Reliability", caption, figure)
 
 
-def pool_reliability(scenes: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pool_reliability(scenes: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reliability bins over scenes of equal weight: claimed probability, realised frequency (NaN without), weight."""
     columns = {name: np.array([scene[name] for scene in scenes], float) for name in ("claimed", "realised", "weight")}
     claimed, realised, weights = map(np.nan_to_num, columns.values())

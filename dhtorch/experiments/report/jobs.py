@@ -39,7 +39,7 @@ _IGNORED_SETTINGS = ("output", "resume", "traceback", "figures", "workers", "thr
 NAMED_GROUPS = ("method", "data", "pairs", "experiment")
 
 
-def differing_settings(results: Sequence[Result]) -> list[dict[str, str]]:
+def _differing_settings(results: Sequence[Result]) -> list[dict[str, str]]:
     """Settings that differ between results: for each result, name → value as text."""
     choices = []
     for result in results:
@@ -73,7 +73,7 @@ def _flatten_config(config: Mapping[str, Any], above: str = "") -> Iterator[tupl
             yield f"{above}{key}", "null" if value is None else str(value)
 
 
-def main_metrics(results: Sequence[Result]) -> list[MainMetric]:
+def _main_metrics(results: Sequence[Result]) -> list[MainMetric]:
     """Metrics of a table of results, without those of which no result has a value; all if none has any."""
     named: dict[str, MainMetric] = {}
     for result in results:
@@ -102,7 +102,7 @@ def _entry(result: Result, variant: str, metric: str) -> Mapping[str, Any]:
 
 
 @dataclass(frozen=True)
-class JobRow:
+class _JobRow:
     """Row of a job and variant."""
 
     labels: list[str]
@@ -110,13 +110,13 @@ class JobRow:
     note: str = ""  # why it has no value, if it has none
 
 
-def job_rows(results: Sequence[Result]) -> tuple[list[str], list[JobRow]]:
+def _job_rows(results: Sequence[Result]) -> tuple[list[str], list[_JobRow]]:
     """Label columns, and a row for every job and variant that has a value; a job without values has one with a note."""
-    settings, metrics = differing_settings(results), main_metrics(results)
+    settings, metrics = _differing_settings(results), _main_metrics(results)
     heads = list(dict.fromkeys(name for row in settings for name in row))
     several = any(len(variant_names(result)) > 1 for result in results)
     heads += ["method"] if several and "method" not in heads else []
-    rows: list[JobRow] = []
+    rows: list[_JobRow] = []
     for result, row in zip(results, settings, strict=True):
         entries = {v: {m.name: _entry(result, v, m.name) for m in metrics} for v in variant_names(result)}
         valued = [v for v, of in entries.items() if any(e.get("value") is not None for e in of.values())]
@@ -125,7 +125,7 @@ def job_rows(results: Sequence[Result]) -> tuple[list[str], list[JobRow]]:
         note = "" if valued else next(iter([*notes, *filter(None, [result.get("why")])]), "")
         for variant in valued or list(entries)[:1]:
             label = {**row, "method": variant} if "method" in heads else row
-            rows.append(JobRow([label.get(name, EMPTY_CELL) for name in heads], entries[variant], note))
+            rows.append(_JobRow([label.get(name, EMPTY_CELL) for name in heads], entries[variant], note))
     return (heads, rows) if heads else (["job"], [replace(row, labels=[str(k + 1)]) for k, row in enumerate(rows)])
 
 
@@ -133,10 +133,10 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
     """Table of jobs with the best value of every column highlighted; None for fewer than two results."""
     if len(results) < 2:
         return None
-    heads, rows = job_rows(results)
+    heads, rows = _job_rows(results)
     head, body, best = list(heads), [list(row.labels) for row in rows], set()
     directions: dict[bool, list[str]] = {True: [], False: []}
-    for metric in main_metrics(results):
+    for metric in _main_metrics(results):
         entries = [row.entries[metric.name] for row in rows]
         values = [entry.get("value") for entry in entries]
         known = {value for value in values if value is not None}
@@ -164,7 +164,7 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
     return ReportTable(format_count(len(results), "job"), head, body, len(heads), note=note, best=frozenset(best))
 
 
-def _has_interval(metric: MainMetric, rows: Sequence[JobRow]) -> bool:
+def _has_interval(metric: MainMetric, rows: Sequence[_JobRow]) -> bool:
     """Whether the intervals of a metric are shown: it is compared with them, and a row has one."""
     return metric.with_interval and any(row.entries[metric.name].get("low") is not None for row in rows)
 
@@ -178,10 +178,10 @@ def write_jobs_csv(path: Path, results: Sequence[Result]) -> Path:
     Raises:
         OSError: the file cannot be written.
     """
-    heads, rows = job_rows(results)
+    heads, rows = _job_rows(results)
     columns = [
         (f"{metric.name}{suffix}", metric.name, field)
-        for metric in main_metrics(results)
+        for metric in _main_metrics(results)
         for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high"))
         if field == "value" or _has_interval(metric, rows)
     ]
@@ -202,8 +202,8 @@ def sweep_figure(results: Sequence[Result]) -> Figure | None:
     each combination of the other options; with options of names alone every combination is a row of a chart instead,
     with its interval where the result has one.
     """
-    heads, rows = job_rows(results)
-    values = {m.name: [row.entries[m.name].get("value") for row in rows] for m in main_metrics(results)}
+    heads, rows = _job_rows(results)
+    values = {m.name: [row.entries[m.name].get("value") for row in rows] for m in _main_metrics(results)}
     metrics = [name for name, of in values.items() if sum(value is not None for value in of) > 1][:6]
     if not metrics:
         return None
