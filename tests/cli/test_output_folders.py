@@ -353,3 +353,19 @@ def test_a_stopped_process_loses_the_frame_that_was_being_made(capture, tmp_path
     assert made.pop("depth/mine.png") == b"mine" and set(made) == set(expected)
     kinds = ("depth", "sigma", "source")
     assert {k: x for k, x in made.items() if k.startswith(kinds)}.items() <= expected.items()
+
+
+@pytest.mark.slow
+def test_two_at_once_with_different_options_do_not_mix(capture, tmp_path):
+    out = tmp_path / "out"
+    words = ["complete", str(capture), f"out={out}", *COMPLETE]
+    ends = []
+    for k, more in enumerate(([], ["seed=7"])):
+        (tmp_path / str(k)).mkdir()
+        ends.append(start(tmp_path / str(k), *words, *more))
+    codes = [process.wait(200) for process in ends]
+    assert sorted(codes) == [run.EXIT_DONE, run.EXIT_FAILED]
+    line = one_line((tmp_path / str(codes.index(run.EXIT_FAILED)) / "err").read_text())
+    assert str(out) in line and ("dhtorch process" in line or "seed" in line)
+    keys = {json.loads(path.read_text())["key"] for path in (out / "meta").iterdir()}
+    assert len(keys) == 1 and len(data.open(out)) == 4

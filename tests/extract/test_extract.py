@@ -195,3 +195,61 @@ def test_a_killed_worker_is_said(monkeypatch):
 
     with pytest.raises(ChildProcessError, match="memory for 1 workers"):
         list(engines.run_local(Deadly(), range(4), 1))
+
+
+def seen(paths):
+    return {p.name: (p.read_bytes(), p.stat().st_ino, p.stat().st_mtime_ns) for p in paths}
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in files(folder)}
+
+
+@pytest.mark.slow
+def test_workers_make_the_same_files(robot, command):
+    assert command(*asked(robot))[0] == 0
+    code, _, err = command(*asked(robot, "workers=2", out="other"))
+    assert code == 0 and err == "", err
+    assert contents("features") == contents("other") and len(files("other")) == 3
+
+
+@pytest.mark.slow
+def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command):
+    """With a worker; then the same command again."""
+    args = [*many, "workers=1"]
+    process = start(tmp_path, "extract", *args)
+    assert stop(process, partial(files, tmp_path / "features"), 3, signal.SIGKILL) == -signal.SIGKILL, (
+        tmp_path / "err"
+    ).read_text()
+    before = seen(files("features"))
+    assert 3 <= len(before) < 12
+    assert all(parquet.read_table(Path("features") / name).num_rows == 1 for name in before)
+    code, out, err = command(*args)
+    assert code == 0, err
+    assert f"12 shards ({len(before)} left untouched), 12 rows" in out
+    after = seen(files("features"))
+    assert {k: after[k] for k in before} == before, "what was finished is untouched"
+    assert FeatureTable("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), (
+        "none lost, none doubled"
+    )
+    assert [p.name for p in (Path("features") / ".dhtorch").iterdir()] == ["manifest"]
+    assert command(*[a.replace("out=features", "out=whole") for a in args])[0] == 0
+    assert contents("whole") == contents("features"), "the same as without the kill"
+
+
+@pytest.fixture
+def damaged(tmp_path, shots):
+    """Numbered frames, the fourth with half an image."""
+    writers.write_counted_frames(tmp_path / "set", shots[:8])
+    image = tmp_path / "set" / "images" / "00003.png"
+    image.write_bytes(image.read_bytes()[:500])
+    place = ["data=auto", f"data.root={tmp_path / 'set'}", "out=features"]
+    return [*place, "extract.gap=2", "extract.shard_rows=3", *PAPER]
+
+
+def test_a_corrupt_frame_raises_in_one_line(damaged, command):
+    code, _, err = command(*damaged, "workers=1")
+    assert code == 2 and "Traceback" not in err and len(without_notes(err)) == 1, err
+    assert all(word in err for word in ("frame 3", "00003.png", "expected", "extract.on_error=skip")), err
+    assert [p.name for p in files("features")] == ["shard-00000.parquet"], "what was whole before it stays"
+    assert [p.name for p in Path("features").glob(".*")] == [".dhtorch"]

@@ -3,8 +3,10 @@
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 from unittest.mock import Mock
 
 import hydra
@@ -14,6 +16,7 @@ import torch
 from support import stored_outputs, writers
 from support.read_back import read_ply
 
+from dhtorch import data
 from dhtorch.cli.run import config_dir, main
 from dhtorch.experiments import report
 from dhtorch.integrate import mapping
@@ -228,3 +231,50 @@ def test_a_voxel_is_two_pixels_of_the_sensor_at_the_median_return_of_three_frame
     assert mapping.choose_voxel([far, far, near, own], [2, 3]) == pytest.approx(0.08)
     limits = [mapping.choose_voxel([own.replace(depth=x * depth)]) for x in (0.0, 0.01, 9.0, 2.2525 / 2)]
     assert limits == [0.02, 0.005, 0.2, 0.09]
+
+
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("holo_a", 0.005, 0.02),
+        ("tum_fr1_desk9", 0.0025, 0.01),
+        ("r3d_door", 0.005, 0.005),
+        ("7s_redkitchen_000", 0.004, 0.012),
+    ],
+)
+def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
+    recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
+    voxel = mapping.choose_voxel(recording)
+    assert least <= voxel <= most and voxel == float(f"{voxel:.2g}")
+    frames = [recording[k] for k in (0, len(recording) // 2, len(recording) - 1)]
+    sizes = []
+    for frame in frames:
+        depth = frame.depth[0].double().numpy()
+        side = float((frame.depth_camera or frame.camera).f.mean())
+        side *= 1 if frame.depth_camera is not None else depth.shape[1] / max(frame.hw[1], 1)
+        sizes.append(float(np.median(depth[np.isfinite(depth) & (depth > 0)])) / side)
+    assert voxel == pytest.approx(max(0.005, 2 * sorted(sizes)[1]), rel=0.06), "two digits"
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    root = os.path.join(os.environ["DHTORCH_DATA"], "tum_fr1_desk9")  # noqa: PTH118
+    options = [
+        "data=tum",
+        f"data.root={root}",
+        "pairs.gap=4",
+        "pairs.stride=4",
+        "method.n=512",
+        "voxel=0.04",
+        "output=here",
+    ]
+    assert main(["integrate", *options, "mesh=false"]) == 0
+    (scene,) = [r for r in result_files.read_result(tmp_path / "here")["rows"] if r["pair"] is None]
+    assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.2
+    assert torch.get_num_threads() == 1 and "tum_fr1_desk9: 3 of 3 frames" in capsys.readouterr().out
+    shutil.rmtree(tmp_path / "here")

@@ -6,7 +6,10 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
+import time
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,6 +17,7 @@ from support.tiny_runs import ROOM
 from torch.autograd import forward_ad
 
 from dhtorch import codes
+from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import (
     plane_sweep,
     pyramid,
@@ -298,3 +302,102 @@ def test_a_compiler_that_is_missing_or_fails_is_reported(tmp_path, monkeypatch):
         with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
             builder.build()
         assert not list(tmp_path.iterdir())
+
+
+def test_a_map_fits_into_the_kernel_and_a_level_is_padded_by_more_than_it_reads():
+    assert max(*lk.TOP_RADII, *lk.MIDDLE_RADII, *lk.FINEST_RADII) <= constants.MAX_MAP_RADIUS_PX
+    reach = pyramid.OUTSIDE_MARGIN_PX + constants.MAX_MAP_RADIUS_PX + 2
+    assert reach <= pyramid.SEARCH_PADDING_PX, "the largest radius, and a row"
+
+
+def run_workers(count, folders, monkeypatch):
+    """{name of a folder: [operators, warnings, whether the answers are torch's] of each worker}, in a new process."""
+    monkeypatch.delenv("DHTORCH_OPS", raising=False)
+    program = Path(__file__).parents[1] / "support" / "library_workers.py"
+    command = [sys.executable, str(program), str(count), *map(str, folders.values())]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(folders, map(json.loads, done.stdout.splitlines()), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked")
+def test_every_worker_of_a_loader_takes_a_sound_library_and_leaves_another(cache, tmp_path, monkeypatch):
+    names = ("sound", "changed", "cut", "foreign", "no manifest")
+    folders = {name: copy_of(cache, tmp_path / name).parent for name in names} | {"none": tmp_path / "none"}
+    folders["none"].mkdir()
+    for name in names[1:]:
+        SPOILED[name][0](folders[name] / loader.library().name)
+    found = run_workers(3, folders, monkeypatch)
+    compiled = f"compiled {loader.level()}"
+    assert found["sound"] == [[compiled, [], True]] * 3 and found["none"] == [["torch", [], True]] * 3
+    for name in names[1:]:
+        for operators, heard, same in found[name]:
+            assert operators == "torch" and same and len(heard) == 1, name
+            assert "(torch is used)" in heard[0] and loader.COMMAND in heard[0], name
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked")
+def test_workers_that_start_while_the_library_is_replaced_have_a_whole_one(cache, tmp_path, monkeypatch):
+    """A build renames the manifest and then the library, again and again, here with a file of other bytes."""
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    path = copy_of(cache, tmp_path / "copy")
+    variants = [path.read_bytes(), path.read_bytes() + bytes(8)]
+    stop, replaced = threading.Event(), []
+
+    def replace():
+        while not stop.is_set():
+            new = write(path.with_name("new.so"), variants[len(replaced) % 2])
+            note = path.with_name("new.json")
+            note.write_text(json.dumps({"sha256": loader.checksum(new)}))
+            note.replace(loader.manifest(path))
+            time.sleep(0.01)
+            new.replace(path)
+            replaced.append(time.monotonic())
+            time.sleep(0.6)
+
+    thread = threading.Thread(target=replace)
+    thread.start()
+    try:
+        found = run_workers(4, {str(k): path.parent for k in range(6)}, monkeypatch)
+    finally:
+        stop.set()
+        thread.join()
+    assert len(replaced) >= 3
+    assert [row for rows in found.values() for row in rows] == [[f"compiled {loader.level()}", [], True]] * 24
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the compiler of this test is a shell script")
+def test_builds_of_several_processes_at_once_leave_one_whole_library(cache, tmp_path, monkeypatch):
+    """Beside them workers start; the compiler here copies a library, slowly."""
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    sound = loader.library()
+    script = tmp_path / "c++"
+    script.write_text(
+        f"""#!/bin/sh
+sleep 0.1
+link=no
+while [ $# -gt 0 ]; do
+  case "$1" in -shared) link=yes;; -o) out="$2";; esac
+  shift
+done
+if [ $link = yes ]; then dd if={sound} of="$out" bs=65536 2>/dev/null; else : > "$out"; fi
+"""
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("CXX", str(script))
+    folder = tmp_path / "cache"
+    copy_of(cache, folder)
+    SPOILED["changed"][0](folder / sound.name)  # so that each process compiles again
+    monkeypatch.setenv("DHTORCH_CACHE", str(folder))
+    builds = [
+        subprocess.Popen([sys.executable, "-m", "dhtorch.ops"], stdout=subprocess.PIPE, text=True) for _ in range(3)
+    ]
+    heard = [build.communicate(timeout=300)[0] for build in builds]
+    assert [build.returncode for build in builds] == [0, 0, 0] and all(sound.name in text for text in heard)
+    path = folder / sound.name
+    assert loader.problem(path) is None and path.read_bytes() == sound.read_bytes()
+    assert {*folder.iterdir()} == {path, loader.manifest(path)}, "nothing unfinished stays"
+    assert run_workers(2, {"built": folder}, monkeypatch) == {"built": [[f"compiled {loader.level()}", [], True]] * 2}

@@ -5,6 +5,7 @@ import contextlib
 import copy
 import json
 import math
+import multiprocessing
 import os
 import shutil
 import stat
@@ -684,3 +685,28 @@ def test_nothing_is_imported_by_a_name_that_is_made_at_run_time():
     allowed = {"__init__.py", "viz/viewer/again.py", "data/io/decode.py", "cli/run.py", "cli/option_checks.py"}
     users = {p.relative_to(ROOT).as_posix() for p in MODULES if "import_module(" in p.read_text(encoding="utf-8")}
     assert users <= allowed
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_killed_writer_leaves_a_whole_file(tmp_path):
+    path = result_files.write_result(tmp_path / "result.json", result())
+    context = multiprocessing.get_context("fork")
+    ready = context.Event()
+    writer = context.Process(target=write_for_ever, args=(path, ready))
+    writer.start()
+    try:
+        assert ready.wait(60)
+        for _ in range(20):
+            assert len(result_files.read_result(path)["rows"]) == 400  # read while it is being replaced
+    finally:
+        writer.kill()
+        writer.join()
+    assert result_files.is_finished(path, KEY)
+
+
+def write_for_ever(path, ready):
+    one = result_files.read_result(path)
+    one["rows"] = one["rows"] * 200
+    while True:
+        result_files.write_result(path, one)
+        ready.set()

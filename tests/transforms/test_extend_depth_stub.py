@@ -12,7 +12,7 @@ from torch.utils.data import default_collate
 
 import dhtorch
 from dhtorch.codes import Gate
-from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem
+from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem, extend_depth
 
 QUIET = {"none": 0, "no_second_view": 0, "no_depth": 0, "unreadable": 0}
 NONE, ALONE, EMPTY, UNREADABLE = range(4)
@@ -256,3 +256,20 @@ def test_options_that_cannot_be_are_refused(options, message):
 
 
 # ---------------------------------------------------------------------------------------------------- gradients, counts
+
+
+def test_workers_count_in_rows_of_their_own(monkeypatch):
+    """More workers than rows share some, and none writes into that of the main process."""
+    extender = tiny()
+    extender.tally.add(torch.tensor([0], dtype=torch.int32))
+    for worker in (0, 1, 126, 127):
+        info = type("Info", (), {"id": worker})()
+        monkeypatch.setattr(extend_depth, "get_worker_info", lambda info=info: info)
+        extender.tally.add(torch.tensor([3, 3]))
+    assert extender.report() == {**QUIET, "none": 1, "unreadable": 8}
+    used = extender.tally.counts.sum(1)
+    assert used[0] == 1 and sorted(used[used > 0].tolist()) == [1, 2, 2, 4]
+    twin = copy.deepcopy(extender)
+    twin.tally.add(torch.tensor([2]))
+    assert twin.report() == {**QUIET, "none": 1, "unreadable": 8, "no_depth": 1} and extender.report()["no_depth"] == 0
+    assert extender.tally.counts.is_shared() and twin.tally.counts.is_shared(), "seen by workers that are spawned later"

@@ -1,8 +1,11 @@
 """Wrappers of data sets and hooks of other projects: one contract for all, and a table of damaged items for an epoch."""
 
 import copy
+import os
 import pickle
 import re
+import subprocess
+import sys
 import warnings
 from functools import partial
 from itertools import pairwise
@@ -737,3 +740,28 @@ def test_a_worker_answers_without_a_graph():
     twin = copy.deepcopy(dataset.transform)
     twin(sample())
     assert twin.report()["none"] == 5 and dataset.transform.report()["none"] == 4
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_worker_forked_beside_opencvs_threads_does_not_wait_for_them():
+    ended = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=True, timeout=60)
+    assert ended.stdout.strip() == "1"
+
+
+FORKED = """
+import os, time, cv2, numpy as np
+from dhtorch.transforms import one_thread
+cv2.setNumThreads(2)
+picture, places = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000, 2), np.float32)
+said = set()
+for _ in range(12):  # on a busy machine the threads are not asleep, and waited for, each time
+    cv2.remap(picture, places, None, cv2.INTER_LINEAR)
+    time.sleep(0.2)
+    pid = os.fork()
+    if pid == 0:
+        one_thread()
+        os._exit(cv2.getNumThreads())
+    said.add(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+print(*said)
+"""
