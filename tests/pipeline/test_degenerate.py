@@ -1,17 +1,12 @@
 """Degenerate and adversarial pairs: nothing raises, every promise is kept, and a broken promise would be seen."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
+from support import degenerate
+from support.degenerate_pairs import KINDS, make
 
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import ransac
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-import degenerate
-from degenerate_pairs import KINDS, make
 
 N = 2 * len(KINDS)
 

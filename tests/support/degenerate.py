@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from degenerate_pairs import KINDS, Pair, make
 from torch import Tensor
 
 from dhtorch import pytree
@@ -20,6 +19,7 @@ from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Estimate, Frame, PoseFit
+from support.degenerate_pairs import KINDS, Pair, make
 
 BATCH = 64
 
