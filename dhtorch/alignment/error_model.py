@@ -260,20 +260,20 @@ class _Problem(NamedTuple):
         r = self.log - log_depth - (self.phi @ xi[:, 2:, None])[..., 0]
         return r, torch.cat((slope * self.head_sd[:, None], self.phi), -1)
 
-    def noise_variance(self, noise: Tensor) -> Tensor:
+    def _noise_variance(self, noise: Tensor) -> Tensor:
         """Noise variance (M, N) of the references under factors (M, 2)."""
         factor = torch.where(self.near, noise[:, :1], noise[:, 1:])
         return (factor.square() * self.var).clamp_min(self.basis.options.min_reference_noise**2)
 
-    def initial_noise(self, r: Tensor) -> Tensor:
+    def _initial_noise(self, r: Tensor) -> Tensor:
         """Residuals (M, N) -> noise factors (M, 2), by medians; 0.455 is the median of a chi-square of one freedom."""
         groups = (self.weight > 0) & torch.stack((self.near, ~self.near))
         squares = [masked_median(r.square() / self.var, group) / 0.455 for group in groups]
         return _bounded_factors(torch.cat(squares, -1), self.basis.options)
 
-    def next_noise(self, r: Tensor, noise: Tensor) -> Tensor:
+    def _next_noise(self, r: Tensor, noise: Tensor) -> Tensor:
         """Noise factors (M, 2) after one step of expectation and maximisation under residuals (M, N)."""
-        weighted_square = _student_weight(r, self.noise_variance(noise), self.freedom) * r.square() / self.var
+        weighted_square = _student_weight(r, self._noise_variance(noise), self.freedom) * r.square() / self.var
         group_weight = self.weight * torch.stack((self.near, ~self.near))
         prior_weight = self.basis.options.stated_noise_weight
         square = ((group_weight * weighted_square).sum(-1) + prior_weight) / (group_weight.sum(-1) + prior_weight)
@@ -282,9 +282,9 @@ class _Problem(NamedTuple):
     def equations(self, xi: Tensor, noise: Tensor) -> Tensor:
         """Stationarity conditions (M, P + 2), zero at the optimum."""
         r, A = self.residuals(xi)
-        variance = self.noise_variance(noise)
+        variance = self._noise_variance(noise)
         score = self.weight * _student_weight(r, variance, self.freedom) / variance * r
-        return torch.cat(((A.mT @ score[..., None])[..., 0] - xi, self.next_noise(r, noise) - noise), -1)
+        return torch.cat(((A.mT @ score[..., None])[..., 0] - xi, self._next_noise(r, noise) - noise), -1)
 
 
 def _bounded_factors(square: Tensor, options: AlignmentOptions) -> Tensor:
@@ -416,23 +416,23 @@ def _optimum(p: _Problem, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     xi = p.x.new_zeros(len(p.x), p.phi.shape[-1] + 2)
     min_scale = (p.basis.options.min_scale - 1) * p.start[:, :1] / p.head_sd[:, :1].clamp_min(1e-12)
     r, A = p.residuals(xi)
-    noise = p.initial_noise(r)
+    noise = p._initial_noise(r)
     eye = torch.eye(xi.shape[1]).to(xi)
     for _ in range(steps):
-        variance = p.noise_variance(noise)
+        variance = p._noise_variance(noise)
         W = A * (p.weight * _student_weight(r, variance, p.freedom) / variance)[..., None]
         step, ok = solve_spd(W.mT @ A + eye, W.mT @ r[..., None] - xi[..., None])
         xi = xi + step[..., 0]
         xi = torch.cat((torch.maximum(xi[:, :1], min_scale), xi[:, 1:]), -1)
         r, A = p.residuals(xi)
-        noise = p.next_noise(r, noise)
+        noise = p._next_noise(r, noise)
     return xi, noise, ok
 
 
 def _laplace(p: _Problem, xi: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Root (M, P, P) of the covariance, log evidence (M,), and whether the Hessian is positive definite (M,)."""
     r, A = p.residuals(xi)
-    variance = p.noise_variance(noise)
+    variance = p._noise_variance(noise)
     eye = torch.eye(xi.shape[1]).to(xi)
     H = (A * (p.weight * _student_weight(r, variance, p.freedom) / variance)[..., None]).mT @ A + eye
     L, info = torch.linalg.cholesky_ex(H)

@@ -144,7 +144,7 @@ def fuse_views(
         integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach, weight) for b in range(len(view.depth))]
         volume = _grow(volume, [i.blocks() for i in integrators], copy=not in_place)
         for integrator, channels in zip(integrators, channel.flatten(1), strict=True):
-            integrator.add_to(volume, channels, carve)
+            integrator._add_to(volume, channels, carve)
     return volume
 
 
@@ -284,7 +284,7 @@ class _ViewIntegrator:
             blocks.append(sparse_grid.occupied_cells(world + along[:, None] * direction, side))
         return torch.cat(blocks).unique()
 
-    def add_to(self, volume: Volume, channels: Tensor, carve: bool) -> None:
+    def _add_to(self, volume: Volume, channels: Tensor, carve: bool) -> None:
         """Update a volume in place, the weights ``channels`` (h · w,) of the pixels; the caller owns the copy."""
         corner = sparse_grid.unpack_cells(volume.key).double() * BLOCK_SIDE * self.voxel
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose

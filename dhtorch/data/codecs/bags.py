@@ -157,12 +157,12 @@ class _Records:
         self, stream: BinaryIO, start: int, end: int, chunk: int | None = None
     ) -> Iterator[IndexedMessage]:
         """Messages of the records between two offsets; ``chunk``: where they are in one, its offset if compressed."""
-        for record in self.iter_records(stream, start, end):
+        for record in self._iter_records(stream, start, end):
             if record.kind == "end":
                 return
             try:
                 if record.kind == "chunk" and chunk is None:
-                    compression, _, start, length = self.parse_chunk(stream, record)
+                    compression, _, start, length = self._parse_chunk(stream, record)
                     inner: tuple[BinaryIO, int, int, int] = stream, start, start + length, -1
                     if compression:
                         content = _read_chunk(self.file, read_version(self.file), record.begin)
@@ -175,7 +175,7 @@ class _Records:
             except (struct.error, UnicodeDecodeError, KeyError) as error:
                 raise FormatError(self.file, f"record at {record.start}", error, "a record of a bag") from None
 
-    def iter_records(self, stream: BinaryIO, at: int, end: int) -> Iterator[_Record]:
+    def _iter_records(self, stream: BinaryIO, at: int, end: int) -> Iterator[_Record]:
         """Whole records between two offsets: code and length of MCAP, header and length of ROS 1, then data."""
         while at + (9 if self.is_mcap else 8) <= end:
             stream.seek(at)
@@ -198,7 +198,7 @@ class _Records:
             yield _Record((_MCAP_KINDS if self.is_mcap else _ROS_1_KINDS).get(code, ""), at, start, length, header)
             at = start + length
 
-    def parse_chunk(self, stream: BinaryIO, record: _Record) -> tuple[str, int, int, int]:
+    def _parse_chunk(self, stream: BinaryIO, record: _Record) -> tuple[str, int, int, int]:
         """(compression, size when unpacked, offset of the content, its stored length)."""
         if not self.is_mcap:
             compression = record.header["compression"].decode("ascii", "replace").replace("none", "")
@@ -270,10 +270,10 @@ def _read_chunk(file: Path, version: tuple[int, ...], begin: int) -> bytes:
     """Unpacked content of the chunk whose record begins at an offset of the file of that version."""
     with open_regular(file) as stream:
         records = _Records(file, is_mcap=read_signature(file) == _MCAP)
-        record = next(records.iter_records(stream, begin, stream.seek(0, 2)), None)
+        record = next(records._iter_records(stream, begin, stream.seek(0, 2)), None)
         if record is None:
             raise FormatError(file, "chunk", "nothing", f"a chunk at {begin}")
-        compression, size, start, length = records.parse_chunk(stream, record)
+        compression, size, start, length = records._parse_chunk(stream, record)
         stream.seek(start)
         return decompress_chunk(stream.read(min(length, MAX_FILE_BYTES)), compression, size, file)
 

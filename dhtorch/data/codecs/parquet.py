@@ -247,7 +247,7 @@ def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
         footer = stream.read(size)
     chunks = []
     try:
-        for number, group in enumerate(_Thrift(footer).iter_structs(4)):
+        for number, group in enumerate(_Thrift(footer)._iter_structs(4)):
             for fields in (column[3] for column in group[1]) if number in groups else ():
                 start, dictionary = int(fields[9]), int(fields.get(11) or 0)
                 kind, codec, values, unpacked, packed = (int(fields[k]) for k in (1, 4, 5, 6, 7))
@@ -289,7 +289,7 @@ class _Thrift:
         """The structure here: field number → value."""
         return {number: self._value(kind, depth) for number, kind in self._fields()}
 
-    def iter_structs(self, field: int) -> Iterator[dict[int, Any]]:
+    def _iter_structs(self, field: int) -> Iterator[dict[int, Any]]:
         """The structures in the list that is this field of the structure here, one by one."""
         for number, kind in self._fields():
             if number != field or kind != 9:

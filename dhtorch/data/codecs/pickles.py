@@ -243,7 +243,7 @@ class _Unpickler:
     def unpack(self, form: str) -> Any:
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
 
-    def since_mark(self) -> list[Any]:
+    def _since_mark(self) -> list[Any]:
         at = len(self.stack) - 1
         while self.stack[at] is not _MARK:
             at -= 1
@@ -255,17 +255,17 @@ class _Unpickler:
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
-        self.take_memory(_BYTES_PER_VALUE.get(type(value), _BYTES_PER_OTHER_VALUE))
+        self._take_memory(_BYTES_PER_VALUE.get(type(value), _BYTES_PER_OTHER_VALUE))
 
-    def remember(self, key: int) -> None:
+    def _remember(self, key: int) -> None:
         self.memo[key] = self.stack[-1]
-        self.take_memory(_BYTES_PER_OTHER_VALUE)
+        self._take_memory(_BYTES_PER_OTHER_VALUE)
 
-    def recall(self, key: int) -> None:
+    def _recall(self, key: int) -> None:
         self.stack.append(self.memo[key])
-        self.take_memory(_BYTES_PER_VALUE[bool])
+        self._take_memory(_BYTES_PER_VALUE[bool])
 
-    def take_memory(self, n: int) -> None:
+    def _take_memory(self, n: int) -> None:
         self.taken += n
         if self.taken > self.most:
             safe_open.check_memory(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
@@ -275,7 +275,7 @@ class _Unpickler:
             raise TypeError(f"{kind.__name__} expected on the stack")
         return self.stack[-1]
 
-    def pop_n(self, n: int) -> tuple[Any, ...]:
+    def _pop_n(self, n: int) -> tuple[Any, ...]:
         if len(self.stack) < n:
             raise IndexError("empty stack")
         items = tuple(self.stack[-n:])
@@ -284,14 +284,14 @@ class _Unpickler:
 
     # ---------------------------------------------------------------------------------------------------- instructions
 
-    def push_text(self, form: str) -> None:
+    def _push_text(self, form: str) -> None:
         self.push(self.take(self.unpack(form)).decode("utf-8", "surrogatepass"))
 
     def extend(self, kind: type, items: Iterable[Any]) -> None:
         target = self.top(kind)
         (target.update if kind is set else target.extend)(items)
 
-    def set_items(self, items: list[Any]) -> None:
+    def _set_items(self, items: list[Any]) -> None:
         target = self.top(dict)
         if len(items) % 2:
             raise ValueError("a key without a value")
@@ -315,13 +315,13 @@ class _Unpickler:
         return self.take(end - self.at + 1)[:-1].decode()
 
     def call(self) -> None:
-        function, args = self.pop_n(2)
+        function, args = self._pop_n(2)
         if type(function) is not _PermittedName or type(args) is not tuple:
             raise TypeError("a call of a name that is not permitted")
         self.push(_PERMITTED_CALLS[function](self.spend, *args))
 
     def build(self) -> None:
-        target, state = self.pop_n(2)
+        target, state = self._pop_n(2)
         if type(target) is _PendingDtype:
             _, order, subarray, names = state[:4]
             if order not in ("<", ">", "|", "=") or subarray is not None or names is not None:
@@ -371,8 +371,8 @@ _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
         "\x80": lambda m: m.take(1),  # PROTO: the version is ignored, unknown instructions raise
         "\x95": lambda m: m.take(8),  # FRAME
         "(": lambda m: m.push(_MARK),
-        "0": lambda m: m.pop_n(1),
-        "1": lambda m: m.since_mark(),
+        "0": lambda m: m._pop_n(1),
+        "1": lambda m: m._since_mark(),
         "2": lambda m: m.push(m.stack[-1]),
         "N": lambda m: m.push(None),
         "\x88": lambda m: m.push(True),
@@ -383,9 +383,9 @@ _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
         "G": lambda m: m.push(m.unpack(">d")),
         "\x8a": lambda m: m.integer(m.unpack("<B")),
         "\x8b": lambda m: m.integer(m.unpack("<i")),
-        "X": lambda m: m.push_text("<I"),
-        "\x8c": lambda m: m.push_text("<B"),
-        "\x8d": lambda m: m.push_text("<Q"),
+        "X": lambda m: m._push_text("<I"),
+        "\x8c": lambda m: m._push_text("<B"),
+        "\x8d": lambda m: m._push_text("<Q"),
         "B": lambda m: m.push(m.take(m.unpack("<I"))),
         "C": lambda m: m.push(m.take(m.unpack("<B"))),
         "\x8e": lambda m: m.push(m.take(m.unpack("<Q"))),
@@ -394,23 +394,23 @@ _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
         "}": lambda m: m.push({}),
         ")": lambda m: m.push(()),
         "\x8f": lambda m: m.push(set()),
-        "l": lambda m: m.push(list(m.since_mark())),
-        "t": lambda m: m.push(tuple(m.since_mark())),
-        "\x85": lambda m: m.push(m.pop_n(1)),
-        "\x86": lambda m: m.push(m.pop_n(2)),
-        "\x87": lambda m: m.push(m.pop_n(3)),
-        "a": lambda m: m.extend(list, m.pop_n(1)),
-        "e": lambda m: m.extend(list, m.since_mark()),
-        "\x90": lambda m: m.extend(set, map(_check_scalar, m.since_mark())),
-        "s": lambda m: m.set_items(list(m.pop_n(2))),
-        "u": lambda m: m.set_items(m.since_mark()),
-        "q": lambda m: m.remember(m.unpack("<B")),
-        "r": lambda m: m.remember(m.unpack("<I")),
-        "\x94": lambda m: m.remember(len(m.memo)),
-        "h": lambda m: m.recall(m.unpack("<B")),
-        "j": lambda m: m.recall(m.unpack("<I")),
+        "l": lambda m: m.push(list(m._since_mark())),
+        "t": lambda m: m.push(tuple(m._since_mark())),
+        "\x85": lambda m: m.push(m._pop_n(1)),
+        "\x86": lambda m: m.push(m._pop_n(2)),
+        "\x87": lambda m: m.push(m._pop_n(3)),
+        "a": lambda m: m.extend(list, m._pop_n(1)),
+        "e": lambda m: m.extend(list, m._since_mark()),
+        "\x90": lambda m: m.extend(set, map(_check_scalar, m._since_mark())),
+        "s": lambda m: m._set_items(list(m._pop_n(2))),
+        "u": lambda m: m._set_items(m._since_mark()),
+        "q": lambda m: m._remember(m.unpack("<B")),
+        "r": lambda m: m._remember(m.unpack("<I")),
+        "\x94": lambda m: m._remember(len(m.memo)),
+        "h": lambda m: m._recall(m.unpack("<B")),
+        "j": lambda m: m._recall(m.unpack("<I")),
         "c": lambda m: m.name(m.line(), m.line()),
-        "\x93": lambda m: m.name(*m.pop_n(2)),
+        "\x93": lambda m: m.name(*m._pop_n(2)),
         "R": _Unpickler.call,
         "b": _Unpickler.build,
     }.items()

@@ -66,7 +66,7 @@ class _Dinov2Weights(NamedTuple):
     origin: str  # name of the file, with what is to be known of it
 
     @property
-    def has_registers(self) -> bool:
+    def _has_registers(self) -> bool:
         """Whether the network has register tokens."""
         return "embeddings.register_tokens" in self.state
 
@@ -372,7 +372,7 @@ def register_count(network: torch.nn.Module) -> int:
 
 def _with_weights(weights: _Dinov2Weights) -> torch.nn.Module:
     """The network of the sizes and parameters of a file, every one of them set."""
-    Config, Model = import_dinov2(registers=weights.has_registers)
+    Config, Model = import_dinov2(registers=weights._has_registers)
     from transformers.utils import logging  # noqa: PLC0415
 
     had_bar, verbosity = logging.is_progress_bar_enabled(), logging.get_verbosity()

@@ -98,10 +98,10 @@ def run(
         if training_answers:
             learned[room] = train_score(list(training_answers.values()), **options)
     options_by_score: dict[str, Callable[[Batch], Mapping[str, Any]]] = {
-        "learned": lambda batch: answers.rescore(batch, score=learned[_room_name(batch.scene)])
+        "learned": lambda batch: answers._rescore(batch, score=learned[_room_name(batch.scene)])
     }
     options_by_score = {
-        score: partial(answers.rescore, score=fn) for score, fn in _HAND_MADE_SCORES.items()
+        score: partial(answers._rescore, score=fn) for score, fn in _HAND_MADE_SCORES.items()
     } | options_by_score
     needs = {"learned": lambda scene: None if _room_name(scene) in learned else "no other room to learn from"}
     variants = {
@@ -234,7 +234,7 @@ class _AnswerCache:
         """Stored pose of a batch."""
         return self._fits[_batch_key(batch)][1]
 
-    def rescore(self, batch: Batch, score: Any) -> dict[str, Any]:
+    def _rescore(self, batch: Batch, score: Any) -> dict[str, Any]:
         """Options of the method that reuse the stored tracks with another score."""
         tracks = self._fits[_batch_key(batch)][0]
         return {"track": lambda *_, **__: tracks, "score": score}
