@@ -25,9 +25,6 @@ from dhtorch.ops import builder, loader
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
-#: Rows are measured in torch unless they say otherwise: :func:`with_compiled_operators`.
-os.environ[loader.SWITCH] = "0"
-
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
@@ -188,7 +185,8 @@ class _LimitInstructions(argparse.Action):
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
-    """The options every script has."""
+    """The options every script has; rows are measured in torch unless they say otherwise (with_compiled_operators)."""
+    os.environ[loader.SWITCH] = "0"
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--full", action="store_true", help="the whole grid instead of the default few minutes")

@@ -8,7 +8,6 @@ Stages: sample, backproject, classify, track, pose, triangulate, score. One pair
 set, else of the built-in room.
 """
 
-import argparse
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -51,15 +50,13 @@ def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = harness.arguments(__doc__ or "")
     parser.add_argument("method", nargs="?", choices=[*METHODS], default="paper")
     parser.add_argument("--stage", choices=STAGES, help="one stage instead of the whole pair")
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--n", type=int, default=2048)
     parser.add_argument("--top", type=int, default=10)
-    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     harness.set_threads(options.threads)
     scene, near, other, *_ = pairs.load(options.batch)

@@ -167,7 +167,8 @@ def test_the_page_needs_nothing_else_and_holds_every_number(name):
             assert f"{number:.5g}" in said or str(number) in said
     words = {row[key] for row in result["rows"] for key in ("scene", "method", "note") if row.get(key)}
     assert words | set(result["summary"]) <= said
-    for part in (result["data"]["name"], result["key"], result["meta"]["utc"], '"levels": 4', result["why"] or ""):
+    settings = json.dumps(result["config"], indent=2)
+    for part in (result["data"]["name"], result["key"], result["meta"]["utc"], settings, result["why"] or ""):
         assert part in whole
 
 
