@@ -15,7 +15,7 @@ from dhtorch.pytree import Record, record
 
 
 @record
-class _ReliabilityDiagram(Record):
+class ReliabilityDiagram(Record):
     """A reliability diagram, bin by bin; an empty bin has weight 0 and NaN for the rest."""
 
     claimed: Tensor  # (bins,) mean claimed probability
@@ -37,7 +37,7 @@ def reliability_diagram(
     *,
     bins: int = 10,
     equal_mass: bool = False,
-) -> _ReliabilityDiagram:
+) -> ReliabilityDiagram:
     """Reliability diagram: mean claimed probability and realised fraction of good answers, in bins.
 
     Args:
@@ -70,7 +70,7 @@ def reliability_diagram(
         return torch.zeros(bins, dtype=torch.float64, device=claimed.device).index_add(0, index, x)
 
     mass = total(weight)
-    return _ReliabilityDiagram(
+    return ReliabilityDiagram(
         claimed=total(weight * claimed) / mass,
         realised=total(weight * good.double()) / mass,
         weight=mass / mass.sum().clamp_min(torch.finfo(torch.float64).tiny),
