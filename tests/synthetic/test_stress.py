@@ -164,7 +164,7 @@ def carried(recording, i, j, motion=None):
     place = (2 * (uv + 0.5) / torch.tensor(recording.hw[::-1]) - 1)[:, None]
     truth = recording.truth(j)
     look = partial(grid_sample, grid=place, align_corners=False)
-    inverse, image = (look(x)[0, :, 0] for x in (1 / truth["depth"][None], recording[j].image))
+    inverse, image = (look(x.double())[0, :, 0] for x in (1 / truth["depth"][None], recording[j].image))
     depth = (xyz[0, :, 2] * inverse[0] - 1).abs()
     inside = (place.abs() < 0.95).all(-1).flatten()
     return (
