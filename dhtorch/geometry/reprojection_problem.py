@@ -17,7 +17,7 @@ shutter bundle adjustment", 2012.
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -227,9 +227,12 @@ def squared_residuals_at(
     Gradient: as :func:`whitened_residuals`.
     """
 
-    @cache
-    def linear() -> _LinearisedTracks:
-        return linearise_tracks(problem, at, columns=False, known=known)
+    linearised: _LinearisedTracks | None = None
+
+    def linear() -> _LinearisedTracks:  # no functools.cache, which torch.compile cannot build within a graph
+        nonlocal linearised
+        linearised = linearise_tracks(problem, at, columns=False, known=known) if linearised is None else linearised
+        return linearised
 
     return lambda noise: _squares(*_track_tensors(problem, known, noise_factors(known, noise), at), linear=linear)
 
