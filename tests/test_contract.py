@@ -515,7 +515,7 @@ ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
     "dhtorch.geometry.determinism.run_without_grad",
     "dhtorch.geometry.camera.check_lens",  # tests/geometry/test_camera.py, tests/ops/test_compiled.py
-    # tests/geometry/test_motion_fit.py, tests/geometry/test_epipolar_motion.py, tests/measure
+    # tests/geometry/test_motion_fit.py, tests/measure
     *(f"dhtorch.geometry.motion_fit.{name}" for name in ("fit_motion", "mean_flow_form", "rotation_from_flow")),
     *(f"dhtorch.geometry.{name}" for name in ("motion_fit.scene_flow", "motion_fit.fit_epipolar_motion")),
     *(f"dhtorch.geometry.covariance.{name}" for name in ("chi2_quantile", "grouped_covariance")),
