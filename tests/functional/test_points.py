@@ -297,3 +297,44 @@ def test_masked_correspondences_are_not_used():
     found = solve(xyz, points2, K_2, mask)
     torch.testing.assert_close(found.world_to_cam, torch.cat((R, t), -1), rtol=0, atol=1e-8)
     assert torch.equal(found.inliers, mask)
+
+
+def test_covariance_is_that_of_random_draws():
+    xyz, points1, points2, R, t = scene(n=4)
+    half = torch.tensor([[0.3, 0.0], [0.1, 0.2]], dtype=torch.float64)
+    pose_half = torch.diag(torch.tensor([1, 1, 1, 3, 3, 3], dtype=torch.float64)) * 2e-4
+    draws = 20_000
+    moved = se3.retract(se3.Pose(R.expand(draws, 3, 3), t[:, 0].expand(draws, 3)), normal(draws, 6) @ pose_half.mT)
+    noisy = points2 + normal(draws, 4, 2, seed=5) @ half.mT
+    X, _ = fn.triangulate_points_one_sided(points1.expand(draws, -1, -1), noisy, K, K_2, moved.R, moved.t[..., None])
+    _, cov = fn.triangulate_points_one_sided(
+        *(points1, points2, K, K_2, R, t),
+        covariance2=(half @ half.mT).expand(4, 2, 2),
+        pose_covariance=pose_half @ pose_half.mT,
+    )
+    off = X - xyz
+    sampled = torch.einsum("dni,dnj->nij", off, off) / draws
+    torch.testing.assert_close(cov, sampled, rtol=0.05, atol=0.02 * float(sampled.abs().max()))
+
+
+def test_a_start_replaces_the_pyramid():
+    points, shift = places(n=20), torch.tensor([14.0, 9.0], dtype=torch.float64)
+    options = {"num_levels": 1, "window_size": 9}
+    alone = fn.track_points_lk(*pictures(shift=shift.tolist()), points, **options)
+    begun = fn.track_points_lk(*pictures(shift=shift.tolist()), points, points + shift + 0.5, **options)
+    right = [(((x.points - points - shift).abs() < 0.1).all(-1) & x.valid).double().mean() for x in (alone, begun)]
+    assert right[0] < 0.5 < 0.9 < right[1]
+
+
+def test_points_on_a_line_have_no_pose_and_leave_the_others_alone():
+    xyz, _, points2, _, _ = scene((2,), n=3)
+    xyz[0] = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.1, 3.0], [0.2, 0.2, 4.0]])
+    poses, valid = fn.solve_p3p(xyz, points2, K_2)
+    assert not valid[0].any() and valid[1].any()
+    assert torch.equal(poses[0], torch.eye(3, 4, dtype=torch.float64).expand(4, 3, 4))
+
+
+def test_gradients_stay_finite_where_there_is_no_pose():
+    xyz, points2 = scene((2,))[0].requires_grad_(), 600 * uniform(2, 12, 2, seed=9)
+    solve(xyz, points2, K_2).world_to_cam.sum().backward()
+    assert xyz.grad.isfinite().all()
