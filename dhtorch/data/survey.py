@@ -43,7 +43,6 @@ class Survey:
     warnings: list[str] = field(default_factory=list)
     tiles: list[Tile] = field(default_factory=list)
     depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the decoded frames
-    path: Tensor | None = None  # (n, 3) m, camera centres
     decoded: dict[int, Frame] = field(default_factory=dict)  # position → frame that was read
 
     def add_fact(self, what: str, text: str) -> None:
@@ -220,7 +219,6 @@ def _report_poses(recording: Recording, out: Survey) -> None:
     if poses is None:
         out.add_fact("poses", "none")
         return
-    out.path = poses.t
     determinant_error = float((torch.linalg.det(poses.R) - 1).abs().max())
     out.add_fact("poses", f"{len(recording)}, determinant within {determinant_error:.1e} of 1")
     if len(recording) < 2:
